@@ -1,0 +1,1 @@
+"""The `brainshift` command."""

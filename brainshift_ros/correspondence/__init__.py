@@ -1,0 +1,1 @@
+"""Vessels on the cortex, and homologous points between scans."""

@@ -1,0 +1,46 @@
+"""Write files whole or not at all, and know a file again by its hash."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from brainshift_ros.errors import InputError
+
+
+@contextmanager
+def atomic_path(target: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside `target`; rename it over `target` on success, remove it on any failure.
+
+    The temporary name keeps the suffixes (``.nii.gz``), since writers choose the format by them.
+    """
+    target = Path(target)
+    if not target.parent.is_dir():
+        raise InputError(target, "its folder does not exist", "create the folder or choose another output path")
+    temporary = target.with_name(f".part-{os.getpid()}-{target.name}")
+    try:
+        yield temporary
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def sha256_of_file(path: str | Path) -> str:
+    """Hex SHA-256 of a file's bytes."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def existing_file(path: str | Path, what: str) -> Path:
+    """`path` if it is a readable file, else an :class:`InputError` that says what was expected there."""
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(path, f"is a folder, not a {what}", f"give the path of a {what}")
+    if not path.is_file():
+        raise InputError(path, "no such file", f"check the path of the {what}")
+    if not os.access(path, os.R_OK):
+        raise InputError(path, "cannot be read (permission denied)", "change its permissions")
+    return path

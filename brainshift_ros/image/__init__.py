@@ -1,0 +1,1 @@
+"""Images: volumes in the patient frame, labels, the template and its landmarks."""

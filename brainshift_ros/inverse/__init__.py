@@ -1,0 +1,1 @@
+"""Fit the atlas to sparse measured displacements."""

@@ -1,0 +1,1 @@
+"""The forward model: weak forms, materials, boundary conditions, linear solvers."""

@@ -1,0 +1,1 @@
+"""Pictures for surgeons and reviewers (matplotlib, no screen needed)."""

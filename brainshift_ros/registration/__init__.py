@@ -1,0 +1,1 @@
+"""Scans from tracker space to patient space."""

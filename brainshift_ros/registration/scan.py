@@ -1,0 +1,35 @@
+"""An organised, textured laser range scan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class OrganisedScan:
+    """A scan whose points lie on the pixel grid of its texture image.
+
+    Attributes
+    ----------
+    points
+        Shape (H, W, 3), float32, metres, in `frame_id`; NaN where nothing was seen.
+    rgb
+        Shape (H, W, 3), uint8.
+    frame_id
+        The frame of `points`.
+    stamp_ns
+        Time of acquisition in nanoseconds.
+    """
+
+    points: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    frame_id: str
+    stamp_ns: int
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Shape (H, W): where all three coordinates are finite."""
+        return np.isfinite(self.points).all(axis=-1)
