@@ -35,7 +35,8 @@ def open_checked(path: str | Path, kind: str, version: int) -> h5py.File:
     try:
         file = h5py.File(path, "r")
     except OSError as error:
-        raise InputError(path, f"is not a readable HDF5 file, or it is cut off ({error})", f"make the {kind} file again") from error
+        problem = f"is not a readable HDF5 file, or it is cut off ({error})"
+        raise InputError(path, problem, f"make the {kind} file again") from error
     found = file.attrs.get("format", "none")
     if found != f"brainshift/{kind}":
         file.close()
@@ -43,7 +44,8 @@ def open_checked(path: str | Path, kind: str, version: int) -> h5py.File:
     found_version = int(file.attrs.get("version", -1))
     if found_version != version:
         file.close()
-        raise InputError(path, f"has format version {found_version}, this software reads {version}", f"make the {kind} file again")
+        problem = f"has format version {found_version}, this software reads {version}"
+        raise InputError(path, problem, f"make the {kind} file again")
     return file
 
 

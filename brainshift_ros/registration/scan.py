@@ -32,4 +32,4 @@ class OrganisedScan:
     @property
     def seen(self) -> NDArray[np.bool_]:
         """Shape (H, W): where all three coordinates are finite."""
-        return np.isfinite(self.points).all(axis=-1)
+        return np.asarray(np.isfinite(self.points).all(axis=-1))
