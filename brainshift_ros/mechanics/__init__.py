@@ -1,1 +1,1 @@
-"""The forward model: weak forms, materials, boundary conditions, linear solvers."""
+"""Forward model: materials, weak forms, boundary conditions, loads, linear solvers, gravity solutions."""

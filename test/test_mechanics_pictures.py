@@ -1,0 +1,40 @@
+"""The picture of boundary conditions shows each kind where it acts."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from mechanics_cases import head
+
+from brainshift_ros.mechanics.boundary import boundary_of, in_cap, node_kinds
+from brainshift_ros.pictures.boundary import boundary_figure, draw_facets
+
+
+def test_the_cap_is_red_on_top_and_the_brainstem_blue():
+    mesh = head(8)
+    boundary = boundary_of(mesh)
+    kinds = [node_kinds(boundary, in_cap(mesh.nodes, down, 0.8)) for down in ([0.0, 0.0, -1.0], [0.0, -1.0, 0.0])]
+    figure = boundary_figure(mesh, [("upright", kinds[0]), ("supine", kinds[1])])
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    upright, supine = figure.axes[0], figure.axes[1]
+    faces = [axes.collections[0].get_facecolor()[:, :3] for axes in (upright, supine)]
+    heights = [
+        np.array([path.vertices[:3, 1].mean() for path in axes.collections[0].get_paths()]) for axes in (upright, supine)
+    ]
+    red = [(face[:, 0] > 1.3 * face[:, 1]) & (face[:, 0] > 1.3 * face[:, 2]) for face in faces]
+    blue = [(face[:, 2] > 1.2 * face[:, 0]) & (face[:, 2] > 1.1 * face[:, 1]) for face in faces]
+    assert heights[0][red[0]].mean() > 30.0 > heights[1][red[1]].mean()  # mm up the page
+    assert heights[0][blue[0]].mean() < -30.0
+    assert len(figure.legends[0].get_texts()) == 3
+
+
+def test_near_facets_are_drawn_last():
+    nodes = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.0, 0, 1], [1, 0, 1], [0, 1, 1]])
+    facets = np.array([[3, 4, 5], [0, 1, 2]], np.int32)
+    colors = np.array([[1.0, 0, 0], [0, 0, 1.0]])
+    for camera, last in ((1.0, [1, 0, 0]), (-1.0, [0, 0, 1])):
+        axes = Figure().subplots()
+        draw_facets(axes, nodes, facets, colors, (0.0, 0.0, camera), (0.0, 1.0, 0.0))
+        np.testing.assert_allclose(axes.collections[0].get_facecolor()[-1, :3], last)
