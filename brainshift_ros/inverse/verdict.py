@@ -1,0 +1,102 @@
+"""When an estimate is valid, and what a person should know about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainshift_ros.inverse.options import InverseOptions
+from brainshift_ros.inverse.problem import WeightSolution
+from brainshift_ros.units import m_to_mm
+
+#: Extents of the measured points below these are too small to tell directions apart, metres.
+_SMALL_PATCH = 0.010
+_THIN_LINE = 0.003
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The facts that the verdict rests on.
+
+    Attributes
+    ----------
+    offered, on_brain
+        Numbers of measured points, and of those that lie on the brain.
+    used
+        Shape (on_brain,), False for outliers.
+    points, measured, estimated
+        Shape (on_brain, 3), metres.
+    sigma
+        Shape (on_brain,), metres.
+    solution
+        The weights.
+    """
+
+    offered: int
+    on_brain: int
+    used: NDArray[np.bool_]
+    points: NDArray[np.float64]
+    measured: NDArray[np.float64]
+    estimated: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    solution: WeightSolution
+
+    @property
+    def residuals(self) -> NDArray[np.float64]:
+        """Length of the residual at the points in use, metres."""
+        return np.linalg.norm(self.estimated - self.measured, axis=1)[self.used]
+
+    @property
+    def mean_shift(self) -> float:
+        """Mean length of the measured displacement at the points in use, metres."""
+        return float(np.mean(np.linalg.norm(self.measured[self.used], axis=1)))
+
+
+def reasons_against(fit: Fit, options: InverseOptions) -> tuple[str, ...]:
+    """Why the estimate is not valid; empty if it is."""
+    reasons = []
+    count = int(fit.used.sum())
+    if count < options.min_points:
+        reasons.append(f"{count} points in use, {options.min_points} are needed")
+    if fit.on_brain < 0.5 * fit.offered:
+        reasons.append(f"only {fit.on_brain} of {fit.offered} points lie on this brain: another patient, or a wrong frame?")
+    if count < 0.6 * fit.on_brain:
+        reasons.append(f"{fit.on_brain - count} of {fit.on_brain} points contradict the others")
+    residual = float(np.mean(fit.residuals))
+    noise = options.max_residual_sigmas * float(np.sqrt(np.mean(fit.sigma[fit.used] ** 2)))
+    gate = max(noise, options.max_residual_fraction * fit.mean_shift)
+    if residual > gate:
+        reasons.append(f"the mean residual of {m_to_mm(residual):.2f} mm exceeds the limit of {m_to_mm(gate):.2f} mm")
+    if not fit.solution.kkt_residual <= options.max_kkt_residual:
+        reasons.append(
+            f"the solver failed: KKT residual {fit.solution.kkt_residual:.1e}, allowed {options.max_kkt_residual:.0e}"
+        )
+    return tuple(reasons)
+
+
+def remarks(fit: Fit) -> tuple[str, ...]:
+    """Say what the data do not determine or the atlas does not span."""
+    found = []
+    outliers = int((~fit.used).sum())
+    if outliers:
+        found.append(f"{outliers} of {fit.on_brain} points were dropped as outliers")
+    if fit.mean_shift < float(np.sqrt(np.mean(fit.sigma[fit.used] ** 2))):
+        found.append(f"the measured shift of {m_to_mm(fit.mean_shift):.2f} mm is below its own noise")
+    elif not fit.solution.weights.any():
+        found.append("no atlas entry moves the points the measured way: every weight is zero")
+    predicted = float(np.mean(np.linalg.norm(fit.estimated[fit.used], axis=1)))
+    if fit.solution.saturated and predicted < 0.9 * fit.mean_shift:
+        names = ", ".join(fit.solution.saturated)
+        found.append(
+            f"the weights of {names} reached their limit: the atlas holds no shift as large as the measured "
+            f"{m_to_mm(fit.mean_shift):.1f} mm"
+        )
+    extent = np.linalg.svd(fit.points[fit.used] - fit.points[fit.used].mean(axis=0), compute_uv=False)
+    extent = np.pad(extent, (0, 3))[:3] / np.sqrt(max(int(fit.used.sum()), 1))
+    if extent[0] < _SMALL_PATCH:
+        found.append(f"the points cover a patch of only {m_to_mm(2 * extent[0]):.0f} mm: the far field is not determined")
+    elif extent[1] < _THIN_LINE:
+        found.append("the points lie nearly on a line: rotation about it is not determined")
+    return tuple(found)
