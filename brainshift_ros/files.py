@@ -44,3 +44,16 @@ def existing_file(path: str | Path, what: str) -> Path:
     if not os.access(path, os.R_OK):
         raise InputError(path, "cannot be read (permission denied)", "change its permissions")
     return path
+
+
+#: What changes when a file is replaced: modification time (ns), size, inode; None where there is no file.
+Signature = tuple[int, int, int]
+
+
+def signature_of(path: str | Path) -> Signature | None:
+    """Recognise a file's present state without reading it."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size, found.st_ino

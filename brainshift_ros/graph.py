@@ -6,8 +6,11 @@ It holds no ROS import, so the numerical core, the bag writer and the runner may
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+
+from brainshift_ros.errors import InputError
 
 PATIENT_FRAME = "patient"
 TRACKER_FRAME = "tracker"
@@ -45,17 +48,13 @@ ATLAS_INFO = Topic("atlas/info", "std_msgs/msg/String", Qos.LATCHED, None, "JSON
 ATLAS_SURFACE = Topic("atlas/surface", "visualization_msgs/msg/Marker", Qos.LATCHED, PATIENT_FRAME, "m")
 LRS_POINTS = Topic("lrs/points", "sensor_msgs/msg/PointCloud2", Qos.RELIABLE, TRACKER_FRAME, "x y z in m, rgb")
 LRS_INITIAL_POSE = Topic("lrs/initial_pose", "geometry_msgs/msg/PoseStamped", Qos.LATCHED, PATIENT_FRAME, "m")
-REGISTRATION = Topic(
-    "registration/patient_from_tracker", "geometry_msgs/msg/TransformStamped", Qos.LATCHED, PATIENT_FRAME, "m"
-)
+REGISTRATION = Topic("registration/patient_from_tracker", "geometry_msgs/msg/TransformStamped", Qos.LATCHED, PATIENT_FRAME, "m")
 LRS_REGISTERED = Topic("lrs/registered", "sensor_msgs/msg/PointCloud2", Qos.RELIABLE, PATIENT_FRAME, "x y z in m, rgb")
 HOMOLOGOUS_POINTS = Topic(
     "homologous_points", "sensor_msgs/msg/PointCloud2", Qos.LATCHED, PATIENT_FRAME, "x y z dx dy dz sigma, all m"
 )
 RETRACTOR_BLADE = Topic("retractor/blade", "geometry_msgs/msg/PolygonStamped", Qos.RELIABLE, PATIENT_FRAME, "m")
-RETRACTOR_DISPLACEMENT = Topic(
-    "retractor/displacement", "geometry_msgs/msg/Vector3Stamped", Qos.RELIABLE, PATIENT_FRAME, "m"
-)
+RETRACTOR_DISPLACEMENT = Topic("retractor/displacement", "geometry_msgs/msg/Vector3Stamped", Qos.RELIABLE, PATIENT_FRAME, "m")
 ATLAS_RETRACTION = Topic(
     "atlas/retraction", "std_msgs/msg/Float32MultiArray", Qos.LATCHED, PATIENT_FRAME, "m; columns x nodes x xyz"
 )
@@ -130,3 +129,18 @@ SERVICES: tuple[Service, ...] = (
 
 #: What a recorded case must hold to be replayed whole.
 CASE_INPUTS: tuple[Topic, ...] = (LRS_INITIAL_POSE, LRS_POINTS, RETRACTOR_BLADE, RETRACTOR_DISPLACEMENT)
+
+
+def topics_named(names: Sequence[str]) -> list[Topic]:
+    """Topics of the graph by their names, with or without the leading slash.
+
+    Raises
+    ------
+    InputError
+        The graph has no such topic; the message lists those it has.
+    """
+    by_name = {topic.name.lstrip("/"): topic for topic in TOPICS}
+    unknown = [name for name in names if name.lstrip("/") not in by_name]
+    if unknown:
+        raise InputError("topic", f"the graph has no {', '.join(unknown)}", f"choose from {', '.join(by_name)}")
+    return [by_name[name.lstrip("/")] for name in names]

@@ -1,0 +1,184 @@
+"""What the four nodes share: heartbeat, diagnostics, checked subscriptions, checked publishers, clean ends."""
+
+from __future__ import annotations
+
+import os
+import traceback
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any, TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+
+from brainshift_ros import graph
+from brainshift_ros.errors import InputError
+from brainshift_ros.graph import Topic
+from brainshift_ros.nodes.health import Health, Level
+from brainshift_ros.nodes.messages import message_class, to_message
+from brainshift_ros.nodes.qos import PROFILES
+from brainshift_ros.nodes.stopping import ros_until_stopped
+from brainshift_ros.nodes.worker import Worker
+from brainshift_ros.wire.plain import Plain
+
+HEARTBEAT_S = 0.4
+
+Value = TypeVar("Value")
+
+
+class BrainshiftNode(Node):
+    """A node of the graph: it takes and gives only what :mod:`brainshift_ros.graph` declares for it.
+
+    No message can end it: a subscription receives bytes, and whatever goes wrong while they are deserialised, checked
+    or handled becomes a diagnostic under the topic's name. Heavy work runs in :attr:`worker`.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.declaration = next(node for node in graph.NODES if node.name == name)
+        self.health = Health(name)
+        self._publishers_by_topic = {topic.name: self._publisher(topic) for topic in self.declaration.gives}
+        self._workers: list[Worker] = []
+        self.worker = self.create_worker()
+        self._concurrent = ReentrantCallbackGroup()
+        # The timer also wakes the executor, which then sees that it shall stop.
+        self.create_timer(HEARTBEAT_S, self._heartbeat)
+
+    def parameter(self, name: str, default: Value, description: str, bounds: tuple[float, float] | None = None) -> Value:
+        """Declare a read-only parameter and return its value.
+
+        Parameters
+        ----------
+        name, default, description
+            As `ros2 param describe` shows them; the type is the default's. The unit is part of the name or description.
+        bounds
+            Smallest and largest value allowed.
+        """
+        descriptor = ParameterDescriptor(description=description, read_only=True)
+        if bounds is not None and isinstance(default, int):
+            descriptor.integer_range = [IntegerRange(from_value=int(bounds[0]), to_value=int(bounds[1]), step=1)]
+        elif bounds is not None:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=float(bounds[0]), to_value=float(bounds[1]))]
+        value: Value = self.declare_parameter(name, default, descriptor).value
+        return value
+
+    def take(self, topic: Topic, decode: Callable[[Any], Value], handle: Callable[[Value], None]) -> None:
+        """Subscribe: `decode` checks a message and turns it into a value of the core, `handle` acts on it.
+
+        A message that `decode` or `handle` refuses is reported and changes nothing; the next good one clears the report.
+        """
+        assert topic in self.declaration.takes, f"graph.py does not declare that {self.get_name()} takes {topic.name}"
+        kind = message_class(topic.type)
+
+        def on_bytes(serialised: bytes) -> None:
+            # Deserialising here, not in rclpy, keeps a malformed serialisation from ending the executor.
+            try:
+                message = deserialize_message(serialised, kind)
+            except Exception as error:
+                self.report(topic.name, Level.ERROR, f"{topic.name}: is not a readable {topic.type} ({error})")
+                return
+            if self.guarded(topic.name, lambda: handle(decode(message))):
+                self.report(topic.name, Level.OK, "received")
+
+        self.create_subscription(kind, topic.name, on_bytes, PROFILES[topic.qos], raw=True)
+
+    def give(self, topic: Topic, plain: Plain) -> None:
+        """Publish a message on a topic that the graph declares for this node."""
+        self._publishers_by_topic[topic.name].publish(to_message(topic.type, plain))
+
+    def serve(self, name: str, answer: Callable[[Any, Any], Any]) -> None:
+        """Offer a service ``~/name`` that the graph declares for this node; `answer` may be a coroutine function."""
+        declared = next(item for item in graph.SERVICES if (item.node, item.name) == (self.get_name(), name))
+        self.create_service(message_class(declared.type), f"~/{name}", answer, callback_group=self._concurrent)
+
+    def create_worker(self) -> Worker:
+        """Start a background thread whose results arrive in the executor's thread."""
+        finished = self.create_guard_condition(lambda: worker.deliver())
+        worker = Worker(finished.trigger)
+        self._workers.append(worker)
+        return worker
+
+    def work(self, condition: str, job: Callable[[], Value], then: Callable[[Value], None], key: str = "") -> None:
+        """Run `job` in the worker thread, then `then` with its result in the executor's thread.
+
+        Parameters
+        ----------
+        condition
+            Under which name to report what goes wrong in either.
+        job, then
+            `then` reports success itself.
+        key
+            A waiting job with the same key (by default: the condition) is replaced.
+        """
+
+        def done(future: Future[Value]) -> None:
+            self.guarded(condition, lambda: then(future.result()))
+
+        self.worker.submit(key or condition, job, done)
+
+    def shut_down(self) -> bool:
+        """Stop the background threads; True if one of them is still in the middle of a job."""
+        for worker in self._workers:
+            worker.stop()
+        return any(worker.busy for worker in self._workers)
+
+    def guarded(self, condition: str, action: Callable[[], object]) -> bool:
+        """Call `action`; turn any exception into a diagnostic. True if all went well."""
+        try:
+            action()
+        except InputError as error:
+            self.report(condition, Level.ERROR, str(error))
+        except Exception as error:
+            self.report(condition, Level.ERROR, f"{condition}: {type(error).__name__}: {error} (a fault of this software)")
+            self.get_logger().error(traceback.format_exc())
+        else:
+            return True
+        return False
+
+    def report(self, condition: str, level: Level, message: str) -> None:
+        """Set a condition; a change is logged and published at once."""
+        if not self.health.set(condition, level, message):
+            return
+        if level is Level.ERROR:
+            self.get_logger().error(message)
+        elif level is Level.WARN:
+            self.get_logger().warning(message)
+        self.publish_health()
+
+    def publish_health(self) -> None:
+        """Publish the node's diagnostics now."""
+        self.give(graph.DIAGNOSTICS, self.health.array(self.now_ns()))
+
+    def now_ns(self) -> int:
+        """Read the node's clock, nanoseconds since the epoch."""
+        nanoseconds: int = self.get_clock().now().nanoseconds
+        return nanoseconds
+
+    def tick(self) -> None:
+        """Do what the node does at each heartbeat, besides reporting."""
+
+    def _heartbeat(self) -> None:
+        self.guarded("heartbeat", self.tick)
+        self.publish_health()
+
+    def _publisher(self, topic: Topic) -> Any:
+        return self.create_publisher(message_class(topic.type), topic.name, PROFILES[topic.qos])
+
+
+def spin(factory: Callable[[], BrainshiftNode]) -> None:
+    """Run a node until SIGINT or SIGTERM; the process ends with status 0 and without a traceback."""
+    with ros_until_stopped() as stop:
+        node = factory()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while not stop.is_set():
+            executor.spin_once()  # the heartbeat ends it after 0.4 s at the latest
+        busy = node.shut_down()
+        executor.shutdown()
+        node.destroy_node()
+    if busy:
+        # A job in native code would be torn down under the interpreter's feet; nothing is left to be saved.
+        os._exit(0)

@@ -1,0 +1,122 @@
+"""visualization_msgs for RViz and Foxglove: the brain's surface, and arrows of displacement with their scale in mm."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainshift_ros.graph import ATLAS_SURFACE, DISPLACEMENT_MARKERS
+from brainshift_ros.units import m_to_mm
+from brainshift_ros.wire.plain import Plain, header
+
+# Of visualization_msgs/msg/Marker.
+_ARROW, _TEXT, _TRIANGLES, _ADD, _DELETE_ALL = 0, 9, 11, 0, 3
+
+_NO_ROTATION = {"position": {"x": 0.0, "y": 0.0, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+#: Matplotlib's viridis at nine equal steps; importing matplotlib would take longer than everything else that a node imports.
+_VIRIDIS = np.array(
+    [
+        [0.267, 0.005, 0.329],
+        [0.279, 0.175, 0.483],
+        [0.230, 0.322, 0.546],
+        [0.173, 0.449, 0.558],
+        [0.128, 0.567, 0.551],
+        [0.158, 0.684, 0.502],
+        [0.369, 0.789, 0.383],
+        [0.678, 0.864, 0.190],
+        [0.993, 0.906, 0.144],
+    ]
+)
+
+
+def surface_marker(nodes: NDArray[np.floating], facets: NDArray[np.integer], stamp_ns: int) -> Plain:
+    """Plain Marker: a translucent triangle surface, each facet with its own three corners, metres, patient frame."""
+    return {
+        "header": header(str(ATLAS_SURFACE.frame), stamp_ns),
+        "ns": "surface",
+        "id": 0,
+        "type": _TRIANGLES,
+        "action": _ADD,
+        "pose": _NO_ROTATION,
+        "scale": {"x": 1.0, "y": 1.0, "z": 1.0},
+        "color": {"r": 0.85, "g": 0.7, "b": 0.65, "a": 0.4},
+        "points": [_point(corner) for corner in nodes[facets].reshape(-1, 3)],
+    }
+
+
+def displacement_markers(
+    nodes: NDArray[np.floating], facets: NDArray[np.integer], displacement: NDArray[np.floating], count: int, stamp_ns: int
+) -> Plain:
+    """Plain MarkerArray: `count` arrows from surface nodes to where they are now, and the colour scale as text.
+
+    Parameters
+    ----------
+    nodes, displacement
+        Shapes (N, 3), metres, patient frame.
+    facets
+        Shape (F, 3): the surface whose nodes carry arrows.
+    count
+        How many arrows at most; nodes are picked evenly over the surface.
+    stamp_ns
+        Time of the measurement.
+
+    Notes
+    -----
+    The first marker deletes the arrows of an earlier field, which may have had more.
+    """
+    chosen = spread_out(nodes, np.unique(facets), count)
+    length_mm = m_to_mm(np.linalg.norm(displacement[chosen], axis=1))
+    largest_mm = float(length_mm.max(initial=0.0))
+    shade = length_mm / largest_mm if largest_mm > 0.0 else length_mm
+    common = {"header": header(str(DISPLACEMENT_MARKERS.frame), stamp_ns), "pose": _NO_ROTATION}
+    arrows = [
+        {
+            **common,
+            "ns": "displacement",
+            "id": number,
+            "type": _ARROW,
+            "action": _ADD,
+            "scale": {"x": 0.0008, "y": 0.002, "z": 0.0},  # shaft and head diameter, metres
+            "color": _colour(fraction),
+            "points": [_point(nodes[node]), _point(nodes[node] + displacement[node])],
+        }
+        for number, (node, fraction) in enumerate(zip(chosen, shade, strict=True))
+    ]
+    above = nodes[chosen].max(axis=0) if len(chosen) else np.zeros(3)
+    scale = [
+        {
+            **common,
+            "ns": "scale",
+            "id": number,
+            "type": _TEXT,
+            "action": _ADD,
+            "pose": {**_NO_ROTATION, "position": _point([0.0, 0.0, above[2] + 0.02 + 0.008 * number])},
+            "scale": {"x": 0.0, "y": 0.0, "z": 0.006},
+            "color": _colour(fraction),
+            "text": f"{fraction * largest_mm:.1f} mm",
+        }
+        for number, fraction in enumerate((0.0, 0.25, 0.5, 0.75, 1.0))
+    ]
+    return {"markers": [{**common, "ns": "", "id": 0, "type": _ARROW, "action": _DELETE_ALL}, *arrows, *scale]}
+
+
+def spread_out(nodes: NDArray[np.floating], candidates: NDArray[np.integer], count: int) -> NDArray[np.integer]:
+    """At most `count` of the candidates, one in each cell of a grid that is just coarse enough: even, and always the same."""
+    if len(candidates) <= count:
+        return candidates
+    low, cell = nodes[candidates].min(axis=0), 1e-3
+    while True:
+        cells = np.floor((nodes[candidates] - low) / cell).astype(np.int64)
+        _, first = np.unique(cells, axis=0, return_index=True)
+        if len(first) <= count:
+            return candidates[np.sort(first)]
+        cell *= 1.1
+
+
+def _colour(fraction: float) -> Plain:
+    steps = np.linspace(0.0, 1.0, len(_VIRIDIS))
+    return {**{name: float(np.interp(fraction, steps, _VIRIDIS[:, i])) for i, name in enumerate("rgb")}, "a": 1.0}
+
+
+def _point(xyz: NDArray[np.floating] | list[float]) -> Plain:
+    return {"x": float(xyz[0]), "y": float(xyz[1]), "z": float(xyz[2])}
