@@ -1,0 +1,104 @@
+"""Read and write NIfTI images: the only place where voxels, millimetres and axis orders of files are interpreted."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import nibabel as nib
+import numpy as np
+from nibabel.filebasedimages import ImageFileError
+from numpy.typing import NDArray
+
+from brainshift_ros.errors import InputError
+from brainshift_ros.files import atomic_path, existing_file
+from brainshift_ros.image.volume import Volume
+from brainshift_ros.units import affine_m_to_mm, affine_mm_to_m
+
+#: Edge lengths of a voxel, in mm, beyond which the affine cannot be in millimetres.
+VOXEL_EDGE_RANGE_MM = (0.05, 20.0)
+
+# NIfTI's spatial unit codes and how many millimetres one unit is; 0 (unknown) means millimetres in practice.
+_MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
+
+
+def read_volume(path: str | Path) -> Volume:
+    """Read a 3-D NIfTI image of any axis orientation and any affine, oblique ones included.
+
+    Parameters
+    ----------
+    path
+        ``.nii`` or ``.nii.gz``.
+
+    Returns
+    -------
+    Volume
+        Voxel values with the file's scaling applied (integers stay integers), and the affine in metres, RAS+.
+
+    Raises
+    ------
+    InputError
+        Missing, not a NIfTI, cut off, not 3-D, without a qform or sform, with a singular affine or an absurd voxel
+        size, with non-finite voxels, or zero everywhere.
+    """
+    path = existing_file(path, "NIfTI image (.nii or .nii.gz)")
+    try:
+        image = nib.load(path)
+    except (ImageFileError, OSError, EOFError, zlib.error, ValueError) as error:
+        raise InputError(path, f"is not a NIfTI image ({error})", "give a .nii or .nii.gz file") from error
+    if not isinstance(image, nib.Nifti1Image):
+        raise InputError(path, f"is a {type(image).__name__}, not a NIfTI image", "convert it to .nii.gz")
+    shape = image.shape
+    while len(shape) > 3 and shape[-1] == 1:
+        shape = shape[:-1]
+    if len(shape) != 3 or min(shape) < 1:
+        raise InputError(path, f"has shape {image.shape}, not three dimensions", "give one 3-D volume")
+    T_patient_voxel = _affine_m(path, image)
+    data = _voxels(path, image).reshape(shape)
+    if not np.isfinite(data).all():
+        count = int(np.count_nonzero(~np.isfinite(data)))
+        raise InputError(path, f"{count} of {data.size} voxels are not finite", "replace NaN and infinity by numbers")
+    if not data.any():
+        raise InputError(path, "every voxel is zero", "give an image with the head in it")
+    return Volume(data, T_patient_voxel)
+
+
+def write_volume(path: str | Path, volume: Volume) -> None:
+    """Write a volume as NIfTI in millimetres, qform and sform set alike; the file appears whole or not at all."""
+    data = volume.data.astype(np.uint8) if volume.data.dtype == np.bool_ else volume.data
+    image = nib.Nifti1Image(data, affine_m_to_mm(volume.T_patient_voxel))
+    image.header.set_xyzt_units("mm", "sec")
+    image.set_sform(image.affine, code="scanner")
+    # The qform cannot hold shears; nibabel then stores the closest rotation, and readers prefer the sform.
+    image.set_qform(image.affine, code="scanner", strip_shears=True)
+    with atomic_path(path) as temporary:
+        nib.save(image, temporary)
+
+
+def _affine_m(path: Path, image: nib.Nifti1Image) -> NDArray[np.float64]:
+    header = image.header
+    if int(header["sform_code"]) == 0 and int(header["qform_code"]) == 0:
+        problem = "has neither a qform nor an sform, so where its voxels lie in the head is unknown"
+        raise InputError(path, problem, "export it again with its orientation, or set the sform")
+    affine = np.array(image.affine, dtype=np.float64)
+    if not np.isfinite(affine).all():
+        raise InputError(path, "its affine is not finite", "repair the qform or sform")
+    affine[:3] *= _MM_PER_UNIT.get(int(header["xyzt_units"]) & 7, 1.0)
+    edges = np.linalg.norm(affine[:3, :3], axis=0)
+    if edges.min() == 0.0 or abs(np.linalg.det(affine[:3, :3] / edges)) < 1e-3:
+        raise InputError(path, "its affine is singular: the voxel axes do not span space", "repair the qform or sform")
+    low, high = VOXEL_EDGE_RANGE_MM
+    if edges.min() < low or edges.max() > high:
+        problem = f"its voxels measure {' x '.join(f'{e:.4g}' for e in edges)} mm, which no head MR has"
+        raise InputError(path, problem, "the affine must be in millimetres; check the unit")
+    return affine_mm_to_m(affine)
+
+
+def _voxels(path: Path, image: nib.Nifti1Image) -> NDArray:
+    try:
+        data = np.asanyarray(image.dataobj)
+    except (OSError, EOFError, zlib.error, ValueError) as error:
+        raise InputError(path, f"is cut off or damaged ({error})", "copy or export the file again") from error
+    if data.dtype.kind not in "uif":
+        raise InputError(path, f"holds voxels of type {data.dtype}, not numbers", "give a scalar image")
+    return np.array(data)

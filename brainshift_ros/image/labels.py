@@ -1,0 +1,82 @@
+"""What a label image and a tumour mask must satisfy, and the brain they describe."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from brainshift_ros.errors import InputError
+from brainshift_ros.image.resample import resample
+from brainshift_ros.image.volume import Region, Volume
+
+
+def labels_on_grid(labels: Volume, t1: Volume, source: object = "label image") -> Volume:
+    """Check a label image and bring it onto the grid of the T1 (nearest neighbour).
+
+    Parameters
+    ----------
+    labels
+        Values of :class:`Region`, on any grid.
+    t1
+        The MR.
+    source
+        What errors name.
+
+    Raises
+    ------
+    InputError
+        Values other than 0 to 5, no brain at all, or a brain that lies outside the T1.
+    """
+    values = np.unique(labels.data)
+    allowed = [int(region) for region in Region]
+    strange = [float(v) for v in values if v not in allowed]
+    if strange:
+        problem = f"holds values other than 0 to {max(allowed)}: {', '.join(f'{v:g}' for v in strange[:5])}"
+        meaning = ", ".join(f"{int(r)} {r.name.lower().replace('_', ' ')}" for r in Region)
+        raise InputError(source, problem, f"use {meaning}")
+    if not labels.data.any():
+        raise InputError(source, "labels no voxel", "label the brain")
+    integral = Volume(labels.data.astype(np.uint8), labels.T_patient_voxel)
+    on_grid = resample(integral, t1, "nearest")
+    expected = np.count_nonzero(integral.data) * voxel_volume(integral)
+    covered = np.count_nonzero(on_grid.data) * voxel_volume(on_grid)
+    seen = np.count_nonzero((on_grid.data > 0) & (t1.data != 0)) * voxel_volume(t1)
+    if covered < 0.5 * expected or seen < 0.5 * expected:
+        problem = f"only {100 * min(covered, seen) / expected:.0f} % of its brain lies on the head of the T1"
+        raise InputError(source, problem, "give labels of the same patient, in the frame of the T1")
+    return on_grid
+
+
+def add_tumor(labels: Volume, tumor: Volume, source: object = "tumour mask") -> Volume:
+    """Write a tumour mask, on any grid, into a label image.
+
+    Raises
+    ------
+    InputError
+        The mask is empty, or less than nine tenths of it lie inside the labelled brain.
+    """
+    inside = Volume((tumor.data > 0).astype(np.uint8), tumor.T_patient_voxel)
+    if not inside.data.any():
+        raise InputError(source, "marks no voxel", "draw the tumour, or leave the mask out")
+    on_grid = resample(inside, labels, "nearest").data > 0
+    expected = np.count_nonzero(inside.data) * voxel_volume(inside)
+    within = np.count_nonzero(on_grid & (labels.data > 0)) * voxel_volume(labels)
+    if within < 0.9 * expected:
+        raise InputError(
+            source, f"only {100 * within / expected:.0f} % of it lies in the brain", "check its frame against the labels"
+        )
+    return Volume(np.where(on_grid & (labels.data > 0), np.uint8(Region.TUMOR), labels.data), labels.T_patient_voxel)
+
+
+def voxel_volume(volume: Volume) -> float:
+    """Volume of one voxel, m^3."""
+    return float(abs(np.linalg.det(volume.T_patient_voxel[:3, :3])))
+
+
+def largest_component(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Keep the largest face-connected part of a mask."""
+    parts, count = ndimage.label(mask)
+    if count <= 1:
+        return mask
+    return parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])

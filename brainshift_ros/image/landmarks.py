@@ -1,0 +1,151 @@
+"""Landmark files: what a person marks once on an image, in millimetres, and the code turns into labels and septa."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from brainshift_ros.errors import InputError
+from brainshift_ros.files import existing_file
+
+Point = Annotated[tuple[float, float, float], Field(description="mm, RAS")]
+Polyline = Annotated[tuple[Point, ...], Field(min_length=2)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Plane(_Part):
+    """A plane; the normal need not be a unit vector."""
+
+    point: Point
+    normal: Point
+
+    def height_mm(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distance along the normal, for points of shape (..., 3) in mm."""
+        normal = np.asarray(self.normal)
+        return (points_mm - np.asarray(self.point)) @ normal / float(np.linalg.norm(normal))
+
+
+class FalxLandmarks(_Part):
+    """The falx's periphery, besides the straight sinus."""
+
+    outer_edge: Polyline = Field(description="from the torcula over the vertex to the crista galli, a little outside the brain")
+    free_edge: Polyline = Field(description="from the crista galli back to the apex of the tentorial notch")
+
+
+class TentoriumLandmarks(_Part):
+    """One side's tentorium, besides the straight sinus."""
+
+    attachment: Polyline = Field(description="from the torcula outward and along the petrous ridge, a little outside the brain")
+    free_edge: Polyline = Field(description="from the petrous apex back to the apex of the tentorial notch")
+    surface: tuple[Point, ...] = Field((), description="points of the sheet between its edges")
+
+    def mirrored(self) -> TentoriumLandmarks:
+        """Return the other side, in a symmetric head."""
+
+        def flip(points: tuple[Point, ...]) -> tuple[Point, ...]:
+            return tuple((-x, y, z) for x, y, z in points)
+
+        return TentoriumLandmarks(attachment=flip(self.attachment), free_edge=flip(self.free_edge), surface=flip(self.surface))
+
+
+class TentoriaLandmarks(_Part):
+    """Both sides of the tentorium."""
+
+    left: TentoriumLandmarks
+    right: TentoriumLandmarks | Literal["mirrored"]
+
+    @property
+    def right_side(self) -> TentoriumLandmarks:
+        """The right side, written out."""
+        return self.left.mirrored() if self.right == "mirrored" else self.right
+
+
+class SeptaLandmarks(_Part):
+    """Falx and tentorium, which meet along the straight sinus."""
+
+    straight_sinus: Polyline = Field(description="from the apex of the tentorial notch back to the torcula")
+    falx: FalxLandmarks
+    tentorium: TentoriaLandmarks
+
+
+class Section(_Part):
+    """A horizontal cross section of the brainstem."""
+
+    z: float
+    y_anterior: float
+    y_posterior: float
+    half_width: float = Field(gt=0.0)
+
+
+class BrainstemLandmarks(_Part):
+    """A tube of superelliptic sections, cut above by a plane."""
+
+    top_plane: Plane
+    exponent: float = Field(2.0, ge=1.0, le=10.0)
+    sections: Annotated[tuple[Section, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _sections_descend(self) -> BrainstemLandmarks:
+        heights = [section.z for section in self.sections]
+        if sorted(heights, reverse=True) != heights or len(set(heights)) != len(heights):
+            raise ValueError("sections must run from above down, each z once")
+        return self
+
+
+class TemplateLandmarks(_Part):
+    """All that turns the template's T1 into labels and septa."""
+
+    midsagittal_plane: Plane
+    septa: SeptaLandmarks
+    brainstem: BrainstemLandmarks
+
+
+class _SeptaFile(_Part):
+    septa: SeptaLandmarks
+
+
+_Model = TypeVar("_Model", bound=BaseModel)
+
+
+def read_septa_landmarks(path: str | Path) -> SeptaLandmarks:
+    """Read the `septa` part of a landmark file in mm of the patient frame.
+
+    Raises
+    ------
+    InputError
+        Missing, not YAML, or a key is unknown, missing or out of range; every fault is named.
+    """
+    content = _content(path)
+    return _validated(path, _SeptaFile, {"septa": content.get("septa", {})} if "septa" in content else content).septa
+
+
+def read_template_landmarks(path: str | Path) -> TemplateLandmarks:
+    """Read a template's whole landmark file; errors as for :func:`read_septa_landmarks`."""
+    return _validated(path, TemplateLandmarks, _content(path))
+
+
+def _content(path: str | Path) -> dict:
+    path = existing_file(path, "landmark file (YAML)")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(path, f"is not YAML: {error}", "see config/template_mni152.yaml for an example") from error
+    if not isinstance(content, dict):
+        raise InputError(path, "holds no landmarks", "see config/template_mni152.yaml for an example")
+    return content
+
+
+def _validated(path: str | Path, model: type[_Model], content: dict) -> _Model:
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        raise InputError(path, faults, "mend these keys; config/template_mni152.yaml shows them all") from error

@@ -1,0 +1,116 @@
+"""Dural septa as triangle sheets: landmarks on the edges and on the sheet, a thin-plate spline between (spec P5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from matplotlib.path import Path as Polygon
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import RBFInterpolator
+from scipy.spatial import Delaunay
+
+from brainshift_ros.geometry import tangent_frame
+from brainshift_ros.image.landmarks import Polyline, SeptaLandmarks
+from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.units import mm_to_m
+
+SeptumName = Literal["falx", "tentorium"]
+
+
+@dataclass(frozen=True)
+class Septum:
+    """A dural sheet that divides the brain; falx or one side of the tentorium.
+
+    Attributes
+    ----------
+    name
+        The facet set that its two sides go to.
+    surface
+        Open triangle sheet that reaches beyond the brain where it is attached to the skull. The falx's normals point
+        right, the tentorium's up.
+    """
+
+    name: SeptumName
+    surface: Surface
+
+
+def septa_from_landmarks(landmarks: SeptaLandmarks, spacing_mm: float = 5.0) -> tuple[Septum, ...]:
+    """Build falx, left and right tentorium.
+
+    The three sheets share the vertices of the straight sinus, where they meet.
+
+    Parameters
+    ----------
+    landmarks
+        In millimetres, patient frame.
+    spacing_mm
+        Distance between neighbouring vertices.
+    """
+    sinus = _polyline(landmarks.straight_sinus, spacing_mm)
+    falx_edge = _polyline([sinus[-1], *landmarks.falx.outer_edge, *landmarks.falx.free_edge, sinus[0]], spacing_mm)
+    septa = [Septum("falx", sheet(np.vstack([sinus, falx_edge[1:-1]]), (), (1.0, 0.0, 0.0), spacing_mm))]
+    for side in (landmarks.tentorium.left, landmarks.tentorium.right_side):
+        edge = _polyline([sinus[-1], *side.attachment, *side.free_edge, sinus[0]], spacing_mm)
+        septa.append(Septum("tentorium", sheet(np.vstack([sinus, edge[1:-1]]), side.surface, (0.0, 0.0, 1.0), spacing_mm)))
+    return tuple(septa)
+
+
+def sheet(ring_mm: ArrayLike, interior_mm: ArrayLike, normal: ArrayLike, spacing_mm: float) -> Surface:
+    """Span a sheet inside a closed edge, through points, as a height over a plane.
+
+    The height is the thin-plate spline through edge and interior points (Duchon 1977), so the sheet bends as little as
+    they allow.
+
+    Parameters
+    ----------
+    ring_mm
+        Closed edge, shape (n, 3), mm, the first point not repeated; these become vertices as they are.
+    interior_mm
+        Shape (m, 3), mm; may be empty.
+    normal
+        Side that the faces' normals point to, and the direction in which the sheet is a height: its projection along
+        `normal` must not overlap itself.
+    spacing_mm
+        Distance between vertices inside.
+    """
+    ring = np.asarray(ring_mm, dtype=np.float64)
+    interior = np.asarray(interior_mm, dtype=np.float64).reshape(-1, 3)
+    R = tangent_frame(normal)
+    ring_local, known = ring @ R.T, np.vstack([ring, interior]) @ R.T
+    height = RBFInterpolator(known[:, :2], known[:, 2], kernel="thin_plate_spline")
+    polygon = Polygon(ring_local[:, :2])
+    grid = _triangular_grid(ring_local[:, :2], spacing_mm)
+    inside = polygon.contains_points(grid)
+    distance = np.min(np.linalg.norm(grid[:, None] - ring_local[None, :, :2], axis=-1), axis=1)
+    grid = grid[inside & (distance > 0.6 * spacing_mm)]
+    local = np.vstack([ring_local, np.column_stack([grid, height(grid)])])
+    faces = Delaunay(local[:, :2]).simplices
+    faces = faces[polygon.contains_points(local[faces, :2].mean(axis=1))]
+    return Surface(mm_to_m(local @ R), _turned_up(local, faces))
+
+
+def _turned_up(local: NDArray[np.float64], faces: NDArray) -> NDArray[np.int32]:
+    a, b, c = np.moveaxis(local[faces, :2], 1, 0)
+    area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    faces = np.where(area[:, None] > 0, faces, faces[:, ::-1])
+    return faces[np.abs(area) > 1e-6].astype(np.int32)
+
+
+def _triangular_grid(points: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
+    low, high = points.min(axis=0), points.max(axis=0)
+    rows = np.arange(low[1], high[1], spacing * np.sqrt(3) / 2)
+    columns = np.arange(low[0] - spacing, high[0] + spacing, spacing)
+    x, y = np.meshgrid(columns, rows)
+    x = x + 0.5 * spacing * (np.arange(len(rows)) % 2)[:, None]
+    return np.column_stack([x.ravel(), y.ravel()])
+
+
+def _polyline(points: Polyline | Sequence[ArrayLike], spacing: float) -> NDArray[np.float64]:
+    """Resample a polyline at about equal steps; its ends stay."""
+    vertices = np.asarray(points, dtype=np.float64)
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(vertices, axis=0), axis=1))])
+    steps = np.linspace(0.0, arc[-1], max(2, round(arc[-1] / spacing) + 1))
+    return np.column_stack([np.interp(steps, arc, vertices[:, k]) for k in range(3)])

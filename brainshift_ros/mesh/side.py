@@ -1,0 +1,74 @@
+"""On which side of an open sheet a point lies, and whether it is beside the sheet at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import open3d as o3d
+import pyvista as pv
+from numpy.typing import NDArray
+
+from brainshift_ros.mesh.surface import Surface
+
+
+@dataclass(frozen=True)
+class SideOfSheet:
+    """Where points lie relative to a sheet.
+
+    Attributes
+    ----------
+    height
+        Shape (n,), metres, along the sheet's normal; its sign is the side.
+    overshoot
+        Shape (n,), metres by which a point lies past the sheet's edge; zero for points beside the sheet.
+    """
+
+    height: NDArray[np.float64]
+    overshoot: NDArray[np.float64]
+
+
+def side_of_sheet(sheet: Surface, points: NDArray[np.float64]) -> SideOfSheet:
+    """Locate points, shape (n, 3), relative to the closest point of a sheet.
+
+    The normal at the closest point is interpolated from the vertices (area weighted), so a closest point on an edge or
+    a ridge has one too (Baerentzen and Aanaes 2005).
+    """
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(sheet.vertices.astype(np.float32), sheet.faces.astype(np.uint32))
+    hit = scene.compute_closest_points(points.astype(np.float32), nthreads=1)
+    u, v = hit["primitive_uvs"].numpy().astype(np.float64).T
+    corners = sheet.faces[hit["primitive_ids"].numpy().astype(np.int64)]
+    weights = np.stack([1.0 - u - v, u, v], axis=1)
+    closest = np.einsum("ni,nik->nk", weights, sheet.vertices[corners])
+    normals = np.einsum("ni,nik->nk", weights, _vertex_normals(sheet)[corners])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    offset = points - closest
+    height = np.einsum("nk,nk->n", offset, normals)
+    at_edge = _on_edge(sheet)[corners]
+    # the closest point is on the sheet's edge if every corner that carries weight is
+    past = np.all(at_edge | (weights < 1e-3), axis=1)
+    overshoot = np.where(past, np.sqrt(np.maximum(np.einsum("nk,nk->n", offset, offset) - height**2, 0.0)), 0.0)
+    return SideOfSheet(height, overshoot)
+
+
+def merged(sheets: list[Surface]) -> Surface:
+    """Join sheets into one, with vertices at the same place made one, so that they meet without an edge between."""
+    poly = pv.merge([pv.PolyData.from_regular_faces(s.vertices, s.faces) for s in sheets], merge_points=False)
+    poly = poly.extract_surface(algorithm=None).clean(tolerance=1e-7, absolute=True)
+    return Surface(np.asarray(poly.points, dtype=np.float64), np.asarray(poly.regular_faces, dtype=np.int32))
+
+
+def _vertex_normals(sheet: Surface) -> NDArray[np.float64]:
+    a, b, c = np.moveaxis(sheet.vertices[sheet.faces], 1, 0)
+    normals = np.zeros_like(sheet.vertices)
+    np.add.at(normals, sheet.faces.ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+
+
+def _on_edge(sheet: Surface) -> NDArray[np.bool_]:
+    edges = np.sort(sheet.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    on_edge = np.zeros(len(sheet.vertices), dtype=bool)
+    on_edge[unique[count == 1].ravel()] = True
+    return on_edge
