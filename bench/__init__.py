@@ -1,0 +1,1 @@
+"""Speed beside accuracy: `make bench`. Figures in the README come from here."""
