@@ -43,7 +43,7 @@ def sample(line, step=1.0):
 
 
 WAVE = [(x, 60 + 15 * np.sin(x / 30)) for x in range(20, 300, 2)]
-FORK = [[(40, 200), (160, 150)], [(160, 150), (290, 120)], [(160, 150), (280, 205)]]
+FORK = [[(40, 170), (160, 150)], [(160, 150), (290, 110)], [(160, 150), (210, 220)]]
 
 
 @pytest.mark.parametrize("width_px", [3, 5, 9])
@@ -61,15 +61,14 @@ def test_centre_lines_lie_on_the_vessels(width_px):
 
 def test_the_branch_point_and_the_ends_are_found():
     tree = trace_vessels(flat_scan(FORK, 5))
-    assert np.linalg.norm(tree.branch_points - [150, 160], axis=1).min() < 4.0
-    for column, row in ((40, 200), (290, 120), (280, 205)):
+    assert np.linalg.norm(tree.branch_points - [150, 160], axis=1).min() < 5.0
+    for column, row in ((40, 170), (290, 110), (210, 220)):
         assert np.linalg.norm(tree.ends - [row, column], axis=1).min() < 6.0
 
 
-def test_width_orders_vessels():
+def test_widths_are_the_painted_ones():
     medians = [np.median(np.concatenate([p.width_m for p in trace_vessels(flat_scan([WAVE], w)).paths])) for w in (3, 9)]
-    assert medians[0] < 0.6 * medians[1]
-    assert medians[1] == pytest.approx(9 * PIXEL_M, rel=0.4)
+    assert medians == [pytest.approx(3 * PIXEL_M, rel=0.35), pytest.approx(9 * PIXEL_M, rel=0.2)]
 
 
 def test_a_shadow_is_no_vessel():
@@ -85,8 +84,8 @@ def test_a_shadow_is_no_vessel():
 def test_light_does_not_change_the_contrast_of_blood():
     rgb = flat_scan([WAVE], 5).rgb.astype(float)
     weight = np.ones(rgb.shape[:2], np.float32)
-    bright = vesselness(blood_contrast(rgb, weight, 20.0), PIXEL_M)[0]
-    dim = vesselness(blood_contrast(0.6 * rgb, weight, 20.0), PIXEL_M)[0]
+    bright = vesselness(blood_contrast(rgb, weight, 20.0), PIXEL_M)
+    dim = vesselness(blood_contrast(0.6 * rgb, weight, 20.0), PIXEL_M)
     on = bright > 0.2
     assert on.sum() > 500
     assert np.median(dim[on] / bright[on]) == pytest.approx(1.0, abs=0.25)
@@ -108,7 +107,7 @@ def test_glints_are_found_repaired_and_bridged():
 def test_a_given_pair_of_ends_is_joined_along_the_vessel():
     scan = flat_scan([WAVE], 5)
     weight = np.ones(scan.rgb.shape[:2], np.float32)
-    strength, _ = vesselness(blood_contrast(scan.rgb, weight, 20.0), PIXEL_M)
+    strength = vesselness(blood_contrast(scan.rgb, weight, 20.0), PIXEL_M)
     start, end = ((round(WAVE[k][1]), round(WAVE[k][0])) for k in (2, -3))
     path = trace_between(strength, start, end)
     assert tuple(path[0]) == start

@@ -19,7 +19,7 @@ from brainshift_ros.field.itk import read_displacement_image, write_displacement
 from brainshift_ros.field.warp import resample_through, warp_image, warp_surface
 from brainshift_ros.image.io import write_volume
 from brainshift_ros.image.volume import Volume
-from brainshift_ros.mesh.locate import boundary_faces
+from brainshift_ros.mesh.nearest import boundary_faces
 from brainshift_ros.mesh.surface import Surface
 
 MESH = ellipsoid_mesh(8)

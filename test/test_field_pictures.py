@@ -12,7 +12,7 @@ from brainshift_ros.field.deformation import Deformation
 from brainshift_ros.field.grid import Grid
 from brainshift_ros.field.warp import warp_image
 from brainshift_ros.image.volume import Volume
-from brainshift_ros.mesh.locate import boundary_faces
+from brainshift_ros.mesh.nearest import boundary_faces
 from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.pictures.field import contour_step, displacement_map, mr_before_after, vectors_on_cortex
 from brainshift_ros.pictures.slices import three_slices

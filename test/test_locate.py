@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
-from brainshift_ros.mesh.locate import PointLocator, boundary_faces, nearest_on_triangles
+from brainshift_ros.mesh.locate import PointLocator
+from brainshift_ros.mesh.nearest import boundary_faces, nearest_on_triangles
 
 
 def delaunay_mesh(seed, count=60):

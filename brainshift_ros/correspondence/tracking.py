@@ -188,7 +188,7 @@ def _choose_candidates(
     view: PlaneView, region: NDArray[np.bool_], cell: float, options: TrackingOptions
 ) -> NDArray[np.float64]:
     """Two-dimensional structure on vessels (branches, bends, crossings), strongest first, at least a spacing apart."""
-    strength, _ = vesselness(view.texture * 0.15, cell)
+    strength = vesselness(view.texture * 0.15, cell)
     window = 2 * round(0.5e-3 * options.window_mm / cell) + 1
     corner = cv2.cornerMinEigenVal(cv2.GaussianBlur(view.texture, (0, 0), 0.35e-3 / cell), window, ksize=3)
     on_vessel = cv2.dilate((strength > 0.04).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

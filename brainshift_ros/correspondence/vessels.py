@@ -13,7 +13,7 @@ from skimage.graph import MCP_Geometric
 from skimage.morphology import skeletonize
 
 from brainshift_ros.correspondence.speculars import repair_speculars
-from brainshift_ros.correspondence.vesselness import blood_contrast, vesselness
+from brainshift_ros.correspondence.vesselness import blood_contrast, vessel_width, vesselness
 from brainshift_ros.registration.opening import pixel_spacing
 from brainshift_ros.registration.scan import OrganisedScan
 
@@ -89,7 +89,7 @@ def trace_vessels(scan: OrganisedScan, region: NDArray[np.bool_] | None = None) 
     repaired, _ = repair_speculars(scan.rgb)
     weight = cv2.erode(_fill_small_holes(region, spacing).astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
     flat = blood_contrast(repaired, weight, 4e-3 / spacing)
-    strength, width = vesselness(flat, spacing)
+    strength, width = vesselness(flat, spacing), vessel_width(flat, spacing)
     margin = cv2.erode(weight, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(1, round(1e-3 / spacing)) + 1,) * 2))
     strength *= margin
     mask = apply_hysteresis_threshold(strength, _WEAK, _STRONG)
@@ -120,7 +120,8 @@ def trace_between(strength: NDArray[np.float32], start: tuple[int, int], end: tu
     pixels
         Shape (n, 2), (row, column), from start to end.
     """
-    cost = 1.0 / (0.02 + np.clip(strength / _STRONG, 0.0, 1.0) ** 2)
+    clear = max(float(np.quantile(strength, 0.99)), _STRONG)
+    cost = 1.0 / (0.02 + np.clip(strength / clear, 0.0, 1.0) ** 2)
     search = MCP_Geometric(cost)
     search.find_costs([start], [end])
     return np.array(search.traceback(end), dtype=np.float64)
