@@ -33,7 +33,7 @@ setup(
         (f"share/{PACKAGE}/launch_scripts", sorted(glob("launch_scripts/*.launch.py"))),
     ],
     install_requires=pinned("runtime.txt"),
-    extras_require={"test": ["pytest", "hypothesis"]},
+    extras_require={"test": ["pytest", "hypothesis", "jsonschema"]},
     zip_safe=True,
     entry_points={
         "console_scripts": [

@@ -36,9 +36,7 @@ def test_first_scan_registers_and_later_scan_gives_points_in_the_patient(session
     points = later.homologous
     assert points is not None
     assert len(points.points) >= 20
-    true_points = transform_points(
-        case.T_patient_tracker @ invert_rigid(first.registration.T_patient_tracker), points.points
-    )
+    true_points = transform_points(case.T_patient_tracker @ invert_rigid(first.registration.T_patient_tracker), points.points)
     assert m_to_mm(np.linalg.norm(true_points - points.points, axis=1)).max() < 1.0
     error_mm = m_to_mm(np.linalg.norm(points.displacements - case.shift(true_points), axis=1))
     assert np.median(error_mm) < 0.8

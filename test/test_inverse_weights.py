@@ -130,6 +130,13 @@ def test_a_shift_against_every_column_gives_no_weights():
     assert solution.kkt_residual == 0.0
 
 
+@pytest.mark.parametrize("rows", [2, 9])
+def test_columns_of_zeros_get_no_weight(rows):
+    solution = solve_weights(WeightProblem(np.zeros((rows, 3)), np.ones(rows), (WeightGroup("gravity", (0, 1, 2)),)))
+    assert not solution.weights.any()
+    assert solution.converged
+
+
 def test_one_column():
     solution = solve_weights(WeightProblem(np.array([[2.0], [0.0]]), np.array([1.0, 5.0]), (WeightGroup("gravity", (0,)),)))
     np.testing.assert_allclose(solution.weights, [0.5])
@@ -196,6 +203,7 @@ def test_an_unknown_method_is_named():
     ("changes", "match"),
     [
         ({"b": np.ones(4)}, "does not match"),
+        ({"A": np.ones((3, 0))}, "nothing to fit"),
         ({"A": np.array([[np.nan, 1.0], [0.0, 1.0], [1.0, 1.0]])}, "finite"),
         ({"groups": (WeightGroup("a", (0, 1)), WeightGroup("b", (1,)))}, "more than one group"),
         ({"groups": (WeightGroup("a", (2,)),)}, "outside 0..1"),

@@ -210,13 +210,17 @@ def test_a_scan_of_elsewhere_is_refused_and_the_case_can_still_be_run(case):
     assert_same(case.send(), case.field)
 
 
-def test_killed_nodes_recover(case):
-    for name in ("lrs", "atlas_loader"):
-        case.running.processes[name].popen.kill()
-        case.running.processes[name].wait()
-        case.running.start(name)
-    # Replayed from a new process: this one still counts the killed subscriber among those it is matched with.
-    assert_same(case.replay()[0], case.field)
+def test_a_reset_is_answered_while_a_scan_is_registered_and_its_result_is_dropped(case):
+    case.reset()
+    registered = len(case.probe.received[graph.REGISTRATION])
+    received = case.probe.conditions("lrs")[graph.LRS_POINTS.name]
+    case.probe.send(graph.LRS_INITIAL_POSE, encode_pose(case.T_start, 1))
+    case.probe.send(graph.LRS_POINTS, encode_scan(case.first))
+    case.probe.until(lambda: case.probe.conditions("lrs")[graph.LRS_POINTS.name] != received, "the scan's arrival")
+    _, seconds = case.probe.call("lrs", "reset")
+    assert seconds < 1.0
+    assert_same(case.send(), case.field)
+    assert len(case.probe.received[graph.REGISTRATION]) == registered + 1
 
 
 def test_a_recording_of_the_graph_holds_the_case_and_its_result(case):
@@ -269,3 +273,12 @@ def test_a_wrong_blade_is_named(case):
     case.probe.says("retractor", ERROR, "retractor/blade: has 2 corners")
     case.probe.send(graph.RETRACTOR_BLADE, encode_blade(BLADE, 1))
     case.probe.says("retractor", OK, "waiting for the displacement")
+
+
+def test_killed_nodes_recover(case):
+    for name in ("lrs", "atlas_loader"):
+        case.running.processes[name].popen.kill()
+        case.running.processes[name].wait()
+        case.running.start(name)
+    # Replayed from a new process: this one still counts the killed subscriber among those it is matched with.
+    assert_same(case.replay()[0], case.field)

@@ -46,7 +46,9 @@ def test_vessels_move_with_the_tissue():
     pose = scanner_pose(case.scene.craniotomy, CLEAN, 0.0, 0.0, 0.0)
     still = take_scan(case.scene, np.eye(4), pose, seed=5, scanner=CLEAN)
     shift = 0.004 * np.cross(case.scene.craniotomy.axis, [0.0, 0.0, 1.0])
-    moved = take_scan(case.scene, np.eye(4), pose, seed=5, scanner=CLEAN, displacement=lambda p: np.broadcast_to(shift, p.shape))
+    moved = take_scan(
+        case.scene, np.eye(4), pose, seed=5, scanner=CLEAN, displacement=lambda p: np.broadcast_to(shift, p.shape)
+    )
     a, b = (np.isfinite(s.material).all(axis=-1) for s in (still, moved))
     distance, index = cKDTree(still.material[a]).query(moved.material[b])
     same = distance < 0.3e-3  # the grids are 0.36 mm wide and lie askew

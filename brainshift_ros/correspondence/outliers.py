@@ -32,7 +32,7 @@ def consistent_points(
     kept = np.ones(len(points), dtype=bool)
     while kept.sum() >= 6:
         index = np.flatnonzero(kept)
-        score = np.array([_misfit(int(k), index[index != k], points, displacements, sigma) for k in index])
+        score = _misfits(points[index], displacements[index], sigma[index])
         worst = score.argmax()
         if score[worst] <= threshold:
             return kept
@@ -41,25 +41,26 @@ def consistent_points(
     return kept
 
 
-def _misfit(
-    k: int,
-    others: NDArray[np.intp],
-    points: NDArray[np.float64],
-    displacements: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-) -> float:
-    distance = np.linalg.norm(points[others] - points[k], axis=1)
-    order = np.argsort(distance, kind="stable")[:_NEIGHBOURS]
-    near, distance = others[order], distance[order]
-    design = np.concatenate([np.ones((len(near), 1)), (points[near] - points[k]) / _REACH_M], axis=1)
+def _misfits(
+    points: NDArray[np.float64], displacements: NDArray[np.float64], sigma: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Distance of each displacement from what its neighbours predict, in standard deviations, shape (n,)."""
+    apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    near = np.argsort(apart, axis=1, kind="stable")[:, : min(_NEIGHBOURS, len(points) - 1)]
+    distance = np.take_along_axis(apart, near, axis=1)
+    offset = (points[near] - points[:, None]) / _REACH_M
+    design = np.concatenate([np.ones((*near.shape, 1)), offset], axis=-1)
     base = np.exp(-0.5 * (distance / _REACH_M) ** 2) + 1e-3
+    # Gradients are damped: neighbours on one side only must not extrapolate a wild slope.
+    ridge = np.diag([1e-6, 0.03, 0.03, 0.03]) * base.sum(axis=1)[:, None, None]
+    moved = displacements[near]
     weight = base
-    ridge = np.diag([1e-6, 0.3, 0.3, 0.3]) * base.sum() * 0.1
     for _ in range(4):
-        weighted = design * weight[:, None]
-        fit = np.linalg.solve(design.T @ weighted + ridge, weighted.T @ displacements[near])
-        residual = np.linalg.norm(displacements[near] - design @ fit, axis=1)
-        scale = max(1.5 * float(np.median(residual)), 0.3e-3)
+        weighted = design * weight[..., None]
+        normal = np.einsum("nki,nkj->nij", design, weighted) + ridge
+        fit = np.linalg.solve(normal, np.einsum("nki,nkd->nid", weighted, moved))
+        residual = np.linalg.norm(moved - design @ fit, axis=-1)
+        scale = np.maximum(1.5 * np.median(residual, axis=1, keepdims=True), 0.3e-3)
         weight = base / (1.0 + (residual / scale) ** 2)
-    error = float(np.linalg.norm(displacements[k] - fit[0]))
-    return error / float(np.hypot(np.sqrt(3) * sigma[k], _SLACK_M))
+    return np.linalg.norm(displacements - fit[:, 0], axis=1) / np.hypot(np.sqrt(3) * sigma, _SLACK_M)

@@ -15,6 +15,10 @@ from brainshift_ros.registration.scan import OrganisedScan
 
 _LIGHT_SIGMA_M = 2.5e-3
 _CONTRAST_SIGMA_M = 6e-3
+_NOISE_CONTRAST = 0.03  # contrast of plain cortex: not to be blown up
+_SPLAT_SIGMA = 0.7  # cells
+_LEAST_COUNT = 0.08  # blurred points a cell
+_LEAST_MATTE = 0.15
 
 
 @dataclass(frozen=True)
@@ -72,8 +76,31 @@ def grid_over(points: NDArray[np.float64], cell_m: float, margin_m: float) -> Pl
     return PlaneGrid(T, cell_m, (int(rows), int(columns)))
 
 
-def view_scan(scan: OrganisedScan, grid: PlaneGrid, region: NDArray[np.bool_] | None = None) -> PlaneView:
-    """Resample a scan by normalised convolution of its scattered points; glints are left out.
+def _cells(
+    scan: OrganisedScan, grid: PlaneGrid, use: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.float64]]:
+    """Flat cell index of the points inside the grid, which of the used points those are, and their heights."""
+    local = transform_points(grid.T_plane_tracker, scan.points[use].astype(np.float64))
+    column, row = np.round(local[:, :2] / grid.cell_m).astype(np.int64).T
+    rows, columns = grid.shape
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    return (row * columns + column)[inside], inside, local[inside, 2]
+
+
+def _splat(grid: PlaneGrid, cell: NDArray[np.int64], values: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
+    """Sum of values (or the count) in each cell, blurred over neighbouring cells."""
+    total = np.bincount(cell, weights=values, minlength=grid.shape[0] * grid.shape[1]).reshape(grid.shape)
+    return np.asarray(cv2.GaussianBlur(total.astype(np.float32), (0, 0), _SPLAT_SIGMA), dtype=np.float32)
+
+
+def covered_cells(scan: OrganisedScan, grid: PlaneGrid, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells of the grid that the scan's pixels `mask` (H, W) cover."""
+    cell, _, _ = _cells(scan, grid, scan.seen & mask)
+    return _splat(grid, cell) > _LEAST_COUNT
+
+
+def view_scan(scan: OrganisedScan, grid: PlaneGrid) -> PlaneView:
+    """Resample a scan by normalised convolution of its scattered points; glints are left out of the texture.
 
     Parameters
     ----------
@@ -81,34 +108,19 @@ def view_scan(scan: OrganisedScan, grid: PlaneGrid, region: NDArray[np.bool_] | 
         Tracker frame.
     grid
         Where to.
-    region
-        Shape (H, W): use only these pixels.
     """
-    use = scan.seen if region is None else scan.seen & region
-    local = transform_points(grid.T_plane_tracker, scan.points[use].astype(np.float64))
-    glint = specular_mask(scan.rgb)[use]
-    column, row = np.round(local[:, :2] / grid.cell_m).astype(np.int64).T
-    rows, columns = grid.shape
-    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-    cell = (row * columns + column)[inside]
-    matte = (~glint[inside]).astype(np.float64)
+    use = scan.seen
+    cell, inside, height = _cells(scan, grid, use)
+    matte = (~specular_mask(scan.rgb)[use][inside]).astype(np.float64)
     color = scan.rgb[use][inside].astype(np.float64)
-    height = local[inside, 2]
-
-    def splat(values: NDArray[np.float64], sigma: float) -> NDArray[np.float32]:
-        total = np.bincount(cell, weights=values, minlength=rows * columns).reshape(rows, columns)
-        return np.asarray(cv2.GaussianBlur(total.astype(np.float32), (0, 0), sigma), dtype=np.float32)
-
-    count, matte_count = splat(np.ones(len(cell)), 0.7), splat(matte, 0.7)
-    seen = count > 0.08
-    textured = matte_count > 0.15
-    mean_height = np.where(seen, splat(height, 0.7) / np.maximum(count, 1e-6), np.nan).astype(np.float32)
-    mean_color = (
-        np.stack([splat(color[:, c] * matte, 0.7) for c in range(2)], axis=-1) / np.maximum(matte_count, 1e-6)[..., None]
-    )
-    weight = textured.astype(np.float32)
+    count, matte_count = _splat(grid, cell), _splat(grid, cell, matte)
+    seen = count > _LEAST_COUNT
+    mean_height = np.where(seen, _splat(grid, cell, height) / np.maximum(count, 1e-6), np.nan).astype(np.float32)
+    mean_color = np.stack([_splat(grid, cell, color[:, c] * matte) for c in range(2)], axis=-1)
+    mean_color /= np.maximum(matte_count, 1e-6)[..., None]
+    weight = (matte_count > _LEAST_MATTE).astype(np.float32)
     flat = blood_contrast(mean_color, weight, _LIGHT_SIGMA_M / grid.cell_m)
     sigma = _CONTRAST_SIGMA_M / grid.cell_m
     variance = cv2.GaussianBlur(flat * flat, (0, 0), sigma) / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)
-    texture = np.clip(flat / np.sqrt(variance + 0.03**2), -4.0, 4.0) * weight
+    texture = np.clip(flat / np.sqrt(variance + _NOISE_CONTRAST**2), -4.0, 4.0) * weight
     return PlaneView(texture.astype(np.float32), mean_height, seen)

@@ -14,13 +14,12 @@ from brainshift_ros.correspondence.coarse_shift import CoarseShift, match_coarse
 from brainshift_ros.correspondence.homologous import HomologousPoints
 from brainshift_ros.correspondence.lifting import lift
 from brainshift_ros.correspondence.outliers import consistent_points
-from brainshift_ros.correspondence.plane_view import PlaneGrid, PlaneView, grid_over, view_scan
+from brainshift_ros.correspondence.plane_view import PlaneGrid, PlaneView, covered_cells, grid_over, view_scan
 from brainshift_ros.correspondence.vesselness import vesselness
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import invert_rigid, transform_points
 from brainshift_ros.registration.opening import pixel_spacing
 from brainshift_ros.registration.scan import OrganisedScan
-
 
 _SPREAD_M = 6e-3
 
@@ -113,7 +112,7 @@ def prepare_first(scan: OrganisedScan, cortex_mask: NDArray[np.bool_], options: 
     cell = max(0.2e-3, pixel_spacing(scan))
     grid = grid_over(scan.points[cortex_mask & scan.seen].astype(np.float64), cell, margin_m=options.reach_mm * 1e-3)
     view = view_scan(scan, grid)
-    inside = view_scan(scan, grid, cortex_mask).seen
+    inside = covered_cells(scan, grid, cortex_mask)
     size = 2 * max(1, round(1e-3 / cell)) + 1
     region = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)) > 0
     candidates = _choose_candidates(view, region, cell, options)
@@ -199,7 +198,7 @@ def _choose_candidates(
         return np.zeros((0, 2))
     corner[corner < 0.01 * np.quantile(corner[corner > 0], 0.99)] = 0.0
     # Strength is judged against the surroundings, so that a bundle of vessels does not take all the points.
-    corner /= np.sqrt(cv2.GaussianBlur(corner, (0, 0), _SPREAD_M / cell) + 1e-12)
+    corner = corner / np.sqrt(cv2.GaussianBlur(corner, (0, 0), _SPREAD_M / cell) + 1e-12)
     radius = options.spacing_mm * 1e-3 / cell
     rows, columns = np.nonzero(corner)
     order = np.argsort(-corner[rows, columns], kind="stable")

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from brainshift_ros.field.displacement import DisplacementField
-from brainshift_ros.field.grid import Grid, trilinear
+from brainshift_ros.field.grid import Grid, reached, trilinear
 from brainshift_ros.field.raster import interpolate, rasterise
 from brainshift_ros.mesh.locate import PointLocator
 
@@ -134,12 +134,11 @@ class Deformation:
         result = interpolate(nodes, elements, nodal, grid, owner)
         T_own_grid = np.linalg.solve(self.grid.T_patient_voxel, grid.T_patient_voxel)
         moves = ndimage.binary_dilation(around.any(axis=-1), iterations=2)
-        last = np.array(self.grid.shape) - 1
         in_plane = np.indices(grid.shape[1:]).reshape(2, -1).T
         across = in_plane @ T_own_grid[:3, 1:3].T + T_own_grid[:3, 3]
         for i in range(grid.shape[0]):  # a plane at a time stays in the cache
             position = across + i * T_own_grid[:3, 0]
-            near = np.flatnonzero((owner[i].reshape(-1) < 0) & ((position >= 0) & (position <= last)).all(axis=1))
+            near = np.flatnonzero((owner[i].reshape(-1) < 0) & reached(position, self.grid.shape, 0.0))
             near = near[moves[tuple(np.rint(position[near]).astype(np.intp).T)]]
             result[i].reshape(-1, 3)[near] = trilinear(around, position[near])
         return result

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainshift_ros.field.deformation import Deformation
-from brainshift_ros.field.grid import Grid, trilinear
+from brainshift_ros.field.grid import Grid, reached, trilinear
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.mesh.surface import Surface
 
@@ -79,7 +79,6 @@ def resample_through(image: Volume, inverse: NDArray, grid: Grid, interpolation:
     T_image_patient = np.linalg.inv(image.T_patient_voxel)
     same = np.allclose(grid.T_patient_voxel, image.T_patient_voxel, rtol=0.0, atol=1e-9)
     T_image_grid = np.eye(4) if same else T_image_patient @ grid.T_patient_voxel
-    shape = np.array(image.shape)
     # Once for all planes; NIfTI readers give Fortran order.
     data = np.ascontiguousarray(image.data, dtype=image.data.dtype if interpolation == "nearest" else np.float32)
     result = np.zeros(grid.shape, dtype=image.data.dtype)
@@ -87,8 +86,8 @@ def resample_through(image: Volume, inverse: NDArray, grid: Grid, interpolation:
     across = in_plane @ T_image_grid[:3, 1:3].T + T_image_grid[:3, 3]
     for i in range(grid.shape[0]):  # a plane at a time stays in the cache
         source = across + i * T_image_grid[:3, 0] + inverse[i].reshape(-1, 3) @ T_image_patient[:3, :3].T
-        reached = np.flatnonzero(((source >= -0.5) & (source < shape - 0.5)).all(axis=1))
-        result[i].reshape(-1)[reached] = _values(data, source[reached], interpolation, result.dtype)
+        inside = np.flatnonzero(reached(source, image.shape, 0.5))
+        result[i].reshape(-1)[inside] = _values(data, source[inside], interpolation, result.dtype)
     return Volume(result, grid.T_patient_voxel)
 
 

@@ -80,3 +80,13 @@ def largest_component(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     if count <= 1:
         return mask
     return parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])
+
+
+def cropped(volume: Volume, mask: NDArray[np.bool_], margin: int) -> Volume:
+    """Cut a volume to the bounding box of a mask on its grid, `margin` voxels wider where the grid allows."""
+    box = ndimage.find_objects(mask.astype(np.uint8))[0]
+    start = [max(axis.start - margin, 0) for axis in box]
+    window = tuple(slice(first, axis.stop + margin) for first, axis in zip(start, box, strict=True))
+    T_patient_voxel = volume.T_patient_voxel.copy()
+    T_patient_voxel[:3, 3] += T_patient_voxel[:3, :3] @ start
+    return Volume(volume.data[window], T_patient_voxel)

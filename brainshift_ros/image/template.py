@@ -6,7 +6,7 @@ import nibabel as nib
 import numpy as np
 from nilearn import datasets
 from numpy.typing import NDArray
-from scipy.interpolate import RBFInterpolator
+from scipy.interpolate import RBFInterpolator, RegularGridInterpolator
 from scipy.ndimage import binary_fill_holes
 
 from brainshift_ros.geometry import transform_points
@@ -17,6 +17,7 @@ from brainshift_ros.resources import resource
 from brainshift_ros.units import affine_mm_to_m, m_to_mm
 
 TEMPLATE_NAME = "MNI152 2009a symmetric, 1 mm (nilearn)"
+_SHEET_STEP_MM = 1.0  # the smooth sheet is tabulated at this step, then interpolated
 _LANDMARK_FILE = "config/template_mni152.yaml"
 
 
@@ -61,12 +62,15 @@ def under_tentorium(points_mm: NDArray[np.float64], landmarks: SeptaLandmarks) -
     known = np.vstack([sinus, *(np.vstack([s.attachment, s.free_edge, np.reshape(s.surface, (-1, 3))]) for s in (left, right))])
     # One closed outline of both sides: left attachment forward, straight across the notch, right attachment back.
     outline = np.vstack([sinus[-1:], left.attachment, right.attachment[::-1]])[:, :2]
-    height = RBFInterpolator(known[:, :2], known[:, 2], kernel="thin_plate_spline", neighbors=40)
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    x, y = (np.arange(low[k], high[k] + _SHEET_STEP_MM, _SHEET_STEP_MM) for k in (0, 1))
+    spline = RBFInterpolator(known[:, :2], known[:, 2], kernel="thin_plate_spline")
+    heights = spline(np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)).reshape(len(x), len(y))
     below = np.zeros(len(points_mm), dtype=bool)
-    candidate = np.flatnonzero(_inside(points_mm[:, :2], outline) & (points_mm[:, 2] < known[:, 2].max()))
-    # The sheet is a height over x and y, so each column of voxels needs it once.
-    columns, column_of = np.unique(points_mm[candidate, :2].round(6), axis=0, return_inverse=True)
-    below[candidate] = points_mm[candidate, 2] < height(columns)[column_of.ravel()]
+    candidate = np.flatnonzero(points_mm[:, 2] < known[:, 2].max())
+    candidate = candidate[_inside(points_mm[candidate, :2], outline)]
+    height = RegularGridInterpolator((x, y), heights)
+    below[candidate] = points_mm[candidate, 2] < height(points_mm[candidate, :2])
     return below
 
 

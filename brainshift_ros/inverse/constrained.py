@@ -51,7 +51,7 @@ def _condensed(problem: WeightProblem) -> WeightProblem:
     """Return a problem with the same minimisers and at most m rows, by a pivoted Cholesky factor of the Gram matrix."""
     A, b = problem.A, problem.b
     rows, columns = A.shape
-    if rows <= 2 * columns:
+    if rows <= 2 * columns or not A.any():
         return problem
     factor, pivots, rank, _ = scipy.linalg.lapack.dpstrf(A.T @ A)  # upper R with P^T A^T A P = R^T R
     order = pivots - 1

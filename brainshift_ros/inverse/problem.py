@@ -27,7 +27,8 @@ class WeightProblem:
     Raises
     ------
     ValueError
-        Shapes do not match, a value is not finite, groups overlap, or a limit is not positive: all programming errors.
+        A is empty, shapes do not match, a value is not finite, groups overlap, or a limit is not positive: the caller's
+        mistakes, all of them.
     """
 
     A: NDArray[np.float64]
@@ -37,6 +38,8 @@ class WeightProblem:
     def __post_init__(self) -> None:
         if self.A.ndim != 2 or self.b.shape != self.A.shape[:1]:
             raise ValueError(f"A of shape {self.A.shape} does not match b of shape {self.b.shape}")
+        if self.A.size == 0:
+            raise ValueError(f"A of shape {self.A.shape} leaves nothing to fit")
         if not (np.isfinite(self.A).all() and np.isfinite(self.b).all()):
             raise ValueError("A and b must be finite")
         columns = [column for group in self.groups for column in group.columns]

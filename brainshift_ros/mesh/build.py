@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import invert_rigid, rigid, transform_points
-from brainshift_ros.image.labels import labels_on_grid, largest_component, voxel_volume
+from brainshift_ros.image.labels import cropped, labels_on_grid, largest_component, voxel_volume
 from brainshift_ros.image.resample import sample
 from brainshift_ros.image.volume import Region, Volume
 from brainshift_ros.mesh.cortex import cortical_surface
@@ -89,6 +89,8 @@ def build_patient(
     report = progress or (lambda stage, fraction: None)
     report("surfaces", 0.0)
     labels = labels_on_grid(labels, t1)
+    brain = labels.data > 0
+    t1, labels = cropped(t1, brain, margin=3), cropped(labels, brain, margin=3)
     shapes = _shapes(labels, tuple(septa), nodes)
     report("mesh", 0.0)
     points, elements = _tetrahedra(shapes, nodes, seed, report)

@@ -67,8 +67,8 @@ def size_field(brain: Surface, tumor: Surface | None, edge_length: float, spacin
     low, high = brain.vertices.min(axis=0) - margin, brain.vertices.max(axis=0) + margin
     axes = [np.arange(a, b + spacing, spacing) for a, b in zip(low, high, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    inside, distance = solid_distance(brain, points)
-    edge = edge_length * relative_edge(points, tumor) + np.where(inside, 0.0, OUTSIDE_GROWTH * distance)
+    outside = np.where(inside_surface(brain, points), 0.0, _distance(brain, points))
+    edge = edge_length * relative_edge(points, tumor) + OUTSIDE_GROWTH * outside
     edge = np.minimum(edge, LARGEST_EDGE * edge_length)
     return SizeField(points, _kuhn_tetrahedra(tuple(len(a) for a in axes)), edge)
 
@@ -93,17 +93,19 @@ def edge_length_for(nodes: int, brain: Surface, tumor: Surface | None) -> float:
 
 def inside_surface(surface: Surface, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether points (n, 3) lie inside a closed surface."""
-    return solid_distance(surface, points)[0]
+    # Several rays a point: one ray may slip through an edge.
+    occupancy = _scene(surface).compute_occupancy(points.astype(np.float32), nthreads=1, nsamples=3)
+    return occupancy.numpy() > 0.5
 
 
-def solid_distance(surface: Surface, points: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Whether points (n, 3) lie inside a closed surface, and how far they are from it in metres."""
+def _distance(surface: Surface, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    return _scene(surface).compute_distance(points.astype(np.float32), nthreads=1).numpy().astype(np.float64)
+
+
+def _scene(surface: Surface) -> o3d.t.geometry.RaycastingScene:
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(surface.vertices.astype(np.float32), surface.faces.astype(np.uint32))
-    query = points.astype(np.float32)
-    # Several rays a point: one ray may slip through an edge.
-    inside = scene.compute_occupancy(query, nthreads=1, nsamples=3).numpy() > 0.5
-    return inside, scene.compute_distance(query, nthreads=1).numpy().astype(np.float64)
+    return scene
 
 
 def _kuhn_tetrahedra(counts: tuple[int, ...]) -> NDArray[np.int32]:

@@ -77,7 +77,7 @@ def face_areas(surface: Surface) -> NDArray[np.float64]:
 
 
 def _polydata(surface: Surface) -> pv.PolyData:
-    return pv.PolyData.from_regular_faces(surface.vertices, surface.faces)
+    return pv.PolyData.from_regular_faces(surface.vertices, surface.faces.astype(np.int64))
 
 
 def _surface(polydata: pv.PolyData) -> Surface:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from brainshift_ros.mesh.facets import face_table, facet_areas
 from brainshift_ros.mesh.quality import dihedral_angles_deg
 
-#: A moved element may lose this share of the mesh's smallest dihedral angle.
+#: A moved element may lose this share of the surface elements' smallest dihedral angle.
 _ANGLE_LOSS = 0.1
 
 
@@ -40,15 +40,17 @@ def restore_volume(
     np.add.at(normals, facets.ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0.0)
-    near = np.isin(elements, facets).any(axis=1)
-    lowest = (1.0 - _ANGLE_LOSS) * dihedral_angles_deg(nodes, elements).min()
+    on_surface = np.zeros(len(nodes), dtype=bool)
+    on_surface[facets] = True
+    near = elements[on_surface[elements].any(axis=1)]
+    lowest = (1.0 - _ANGLE_LOSS) * dihedral_angles_deg(nodes, near).min()
     moved = nodes
     for _ in range(4):
         missing = volume - _volumes(moved, elements[body]).sum()
         trial = moved + missing / facet_areas(moved, facets).sum() * normals
-        spoiled = _volumes(trial, elements) <= 0.0
-        spoiled[near] |= dihedral_angles_deg(trial, elements[near]).min(axis=1) < lowest
-        normals[elements[spoiled].ravel()] = 0.0
+        spoiled = _volumes(trial, near) <= 0.0
+        spoiled |= dihedral_angles_deg(trial, near).min(axis=1) < lowest
+        normals[near[spoiled].ravel()] = 0.0
         moved = np.where(normals.any(axis=1, keepdims=True), trial, moved)
         if spoiled.any():
             moved = nodes

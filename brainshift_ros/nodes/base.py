@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import traceback
 from collections.abc import Callable
@@ -72,6 +73,7 @@ class BrainshiftNode(Node):
         """
         assert topic in self.declaration.takes, f"graph.py does not declare that {self.get_name()} takes {topic.name}"
         kind = message_class(topic.type)
+        good = itertools.count(1)
 
         def on_bytes(serialised: bytes) -> None:
             # Deserialising here, not in rclpy, keeps a malformed serialisation from ending the executor.
@@ -81,7 +83,7 @@ class BrainshiftNode(Node):
                 self.report(topic.name, Level.ERROR, f"{topic.name}: is not a readable {topic.type} ({error})")
                 return
             if self.guarded(topic.name, lambda: handle(decode(message))):
-                self.report(topic.name, Level.OK, "received")
+                self.report(topic.name, Level.OK, f"{next(good)} received")
 
         self.create_subscription(kind, topic.name, on_bytes, PROFILES[topic.qos], raw=True)
 

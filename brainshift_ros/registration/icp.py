@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from brainshift_ros.geometry import rigid, transform_points
 from brainshift_ros.registration.target import CortexTarget
 
-_SMALLEST_STEP_M = 2e-6
+_SMALLEST_STEP = 1e-3  # of the correspondence distance
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,6 @@ def robust_icp(
         rotation = Rotation.from_rotvec(step[:3])
         T = rigid(rotation, pivot - rotation.apply(pivot) + step[3:]) @ T
         radius = float(np.sqrt(np.mean(np.sum((at - pivot) ** 2, axis=1))))
-        if np.linalg.norm(step[:3]) * radius + np.linalg.norm(step[3:]) < _SMALLEST_STEP_M:
+        if np.linalg.norm(step[:3]) * radius + np.linalg.norm(step[3:]) < _SMALLEST_STEP * distance_m:
             return IcpFit(T, done)
     return IcpFit(T, iterations)

@@ -42,7 +42,7 @@ class RegistrationOptions:
         Limits of the verdict.
     """
 
-    voxels_mm: tuple[float, ...] = (3.0, 2.0, 1.2)
+    voxels_mm: tuple[float, ...] = (4.0, 2.5, 1.2)
     distances_mm: tuple[float, ...] = (10.0, 5.0, 2.5)
     iterations: tuple[int, ...] = (40, 40, 30)
     restart_mm: float = 6.0

@@ -104,10 +104,13 @@ def spread_out(nodes: NDArray[np.floating], candidates: NDArray[np.integer], cou
     """At most `count` of the candidates, one in each cell of a grid that is just coarse enough: even, and always the same."""
     if len(candidates) <= count:
         return candidates
-    low, cell = nodes[candidates].min(axis=0), 1e-3
+    offset = nodes[candidates] - nodes[candidates].min(axis=0)
+    # A closed surface of extent L passes through some 6 (L / cell)^2 cells; this starts finer than needed and grows.
+    cell = float(offset.max()) / np.sqrt(count)
     while True:
-        cells = np.floor((nodes[candidates] - low) / cell).astype(np.int64)
-        _, first = np.unique(cells, axis=0, return_index=True)
+        column, row, layer = np.floor(offset / cell).astype(np.int64).T
+        side = int(max(column.max(), row.max(), layer.max())) + 1
+        _, first = np.unique((layer * side + row) * side + column, return_index=True)
         if len(first) <= count:
             return candidates[np.sort(first)]
         cell *= 1.1

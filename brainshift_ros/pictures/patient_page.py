@@ -1,0 +1,165 @@
+"""One page on a patient model: septa and regions on the MR, the mesh cut open, the septa in space, mesh quality."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyvista as pv
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from numpy.typing import NDArray
+
+from brainshift_ros.files import atomic_path
+from brainshift_ros.image.resample import sample
+from brainshift_ros.image.volume import Region, Volume
+from brainshift_ros.mesh.patient import PatientModel, Tissue
+from brainshift_ros.mesh.quality import dihedral_angles_deg
+from brainshift_ros.units import m_to_mm, mm_to_m
+
+SEPTA_COLOURS = {"falx": "#ff9d00", "tentorium": "#e5006d"}
+TISSUE_COLOURS = {Tissue.WHITE: "#e9e4d4", Tissue.GREY: "#a9a3a0", Tissue.TUMOR: "#c0392b"}
+REGION_COLOURS = {
+    Region.LEFT_CEREBRUM: "#31c6d4",
+    Region.RIGHT_CEREBRUM: "#3d7eff",
+    Region.CEREBELLUM: "#35c46a",
+    Region.BRAINSTEM: "#ffd23f",
+    Region.TUMOR: "#ff4d4d",
+}
+_PLANES = {0: ("sagittal", "y", "z"), 1: ("coronal", "x", "z"), 2: ("axial", "x", "y")}
+
+
+def patient_page(patient: PatientModel, t1: Volume, path: str | Path) -> None:
+    """Draw the page and write it as PNG (or whatever the suffix says).
+
+    Parameters
+    ----------
+    patient
+        With septa or without.
+    t1
+        The MR that the model was made from.
+    path
+        Output file.
+    """
+    figure = Figure(figsize=(19, 12), layout="constrained")
+    axes = [[figure.add_subplot(2, 3, 1 + 3 * row + column) for column in range(3 - row)] for row in range(2)]
+    centre = _centre(patient)
+    for axes_2d, axis, at in zip(axes[0], (0, 1, 2), (0.004, -0.055, centre[2]), strict=True):
+        draw_slice(axes_2d, patient, t1, axis, at)
+    draw_cut(axes[1][0], patient, 1, centre[1])
+    draw_cut(axes[1][1], patient, 2, centre[2])
+    space = figure.add_subplot(2, 3, 6, projection="3d")
+    _draw_septa_in_space(space, patient)
+    _inset_quality(axes[1][1], patient)
+    handles = [Patch(color=colour, label=region.name.lower().replace("_", " ")) for region, colour in REGION_COLOURS.items()]
+    handles += [Patch(color=colour, label=name) for name, colour in SEPTA_COLOURS.items() if name in patient.mesh.facets]
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=90)
+
+
+def draw_slice(axes: Axes, patient: PatientModel, t1: Volume, axis: int, at: float) -> None:
+    """Show the MR on the plane where coordinate `axis` equals `at` (metres), with outlines of regions and septa."""
+    first, second = (k for k in range(3) if k != axis)
+    low, high = patient.mesh.nodes.min(axis=0) - 0.006, patient.mesh.nodes.max(axis=0) + 0.006
+    u, v = (np.arange(low[k], high[k], 0.001) for k in (first, second))
+    points = np.zeros((len(v), len(u), 3))
+    points[..., axis], points[..., first], points[..., second] = at, u[None, :], v[:, None]
+    extent = (m_to_mm(u[0]), m_to_mm(u[-1]), m_to_mm(v[0]), m_to_mm(v[-1]))
+    axes.imshow(sample(t1, points), cmap="gray", origin="lower", extent=extent)
+    section = _section(patient, axis, at)
+    for region, colour in REGION_COLOURS.items():
+        cells = section.extract_cells(np.flatnonzero(section.cell_data["region"] == region))
+        edges = cells.extract_surface(algorithm=None).extract_feature_edges(
+            boundary_edges=True, feature_edges=False, manifold_edges=False, non_manifold_edges=False
+        )
+        axes.add_collection(LineCollection(_segments(edges, first, second), colors=colour, linewidths=1.0))
+    _draw_septa_lines(axes, patient, axis, at)
+    _name_plane(axes, axis, at)
+
+
+def draw_cut(axes: Axes, patient: PatientModel, axis: int, at: float) -> None:
+    """Show the elements cut by a plane, coloured by tissue, with the septa."""
+    first, second = (k for k in range(3) if k != axis)
+    section = _section(patient, axis, at)
+    points = m_to_mm(section.points[:, [first, second]])
+    polygons = [points[cell.point_ids] for cell in section.cell]
+    colours = [to_rgb(TISSUE_COLOURS[Tissue(t)]) for t in section.cell_data["tissue"]]
+    axes.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors="#5b5550", linewidths=0.25))
+    _draw_septa_lines(axes, patient, axis, at)
+    axes.set_aspect("equal")
+    axes.autoscale_view()
+    _name_plane(axes, axis, at)
+
+
+def _centre(patient: PatientModel) -> NDArray[np.float64]:
+    """Where to cut: through the tumour if there is one."""
+    mesh = patient.mesh
+    tumor = mesh.region == Region.TUMOR
+    chosen = mesh.elements[tumor] if tumor.any() else mesh.elements
+    return mesh.nodes[chosen].mean(axis=(0, 1))
+
+
+def _section(patient: PatientModel, axis: int, at: float) -> pv.PolyData:
+    mesh = patient.mesh
+    cells = {pv.CellType.TETRA: mesh.elements.astype(np.int64)}
+    grid = pv.UnstructuredGrid(cells, mesh.nodes)
+    grid.cell_data["region"], grid.cell_data["tissue"] = mesh.region, patient.tissue
+    # half a micrometre off: a plane through nodes, as the midsagittal one, would cut nothing
+    return grid.slice(normal=np.eye(3)[axis], origin=np.eye(3)[axis] * (at + 5e-7), generate_triangles=False)
+
+
+def _draw_septa_lines(axes: Axes, patient: PatientModel, axis: int, at: float) -> None:
+    first, second = (k for k in range(3) if k != axis)
+    for name, colour in SEPTA_COLOURS.items():
+        if name in patient.mesh.facets:
+            sheet = pv.PolyData.from_regular_faces(patient.mesh.nodes, patient.mesh.facets[name].astype(np.int64))
+            lines = sheet.slice(normal=np.eye(3)[axis], origin=np.eye(3)[axis] * (at + 5e-7))
+            axes.add_collection(LineCollection(_segments(lines, first, second), colors=colour, linewidths=2.2))
+
+
+def _segments(lines: pv.PolyData, first: int, second: int) -> NDArray[np.float64]:
+    if lines.n_cells == 0:
+        return np.empty((0, 2, 2))
+    return m_to_mm(lines.points[:, [first, second]])[lines.lines.reshape(-1, 3)[:, 1:]]
+
+
+def _name_plane(axes: Axes, axis: int, at: float) -> None:
+    name, horizontal, vertical = _PLANES[axis]
+    axes.set_title(f"{name}, {'xyz'[axis]} = {float(m_to_mm(at)):.0f} mm", fontsize=10)
+    axes.set_xlabel(f"{horizontal} (mm, RAS)")
+    axes.set_ylabel(f"{vertical} (mm, RAS)")
+
+
+def _draw_septa_in_space(axes: Axes, patient: PatientModel) -> None:
+    mesh = patient.mesh
+    skull = mesh.facets["skull"]
+    shown = skull[mesh.nodes[skull].mean(axis=1)[:, 0] > mm_to_m(2.0)]
+    parts = [(shown, "#c9c2bb", 0.10)]
+    parts += [(mesh.facets[name], colour, 0.95) for name, colour in SEPTA_COLOURS.items() if name in mesh.facets]
+    if "tumor" in mesh.facets:
+        parts.append((mesh.facets["tumor"], TISSUE_COLOURS[Tissue.TUMOR], 0.9))
+    for facets, colour, alpha in parts:
+        triangles = m_to_mm(mesh.nodes[facets])
+        normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        light = np.abs(normals @ [-0.7, -0.3, 0.65]) / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+        shade = np.outer(0.45 + 0.55 * light, to_rgb(colour))
+        axes.add_collection3d(Poly3DCollection(triangles, facecolors=np.column_stack([shade, np.full(len(shade), alpha)])))
+    low, high = m_to_mm(mesh.nodes.min(axis=0)), m_to_mm(mesh.nodes.max(axis=0))
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]), box_aspect=high - low)
+    axes.view_init(elev=18, azim=-155)
+    axes.set_axis_off()
+    axes.set_title("septa in the mesh, from the left and behind", fontsize=10)
+
+
+def _inset_quality(axes: Axes, patient: PatientModel) -> None:
+    angles = dihedral_angles_deg(patient.mesh.nodes, patient.mesh.elements).min(axis=1)
+    inset = axes.inset_axes((1.06, 0.05, 0.3, 0.2))
+    inset.hist(angles, bins=np.arange(0, 73, 3), color="#5b7fa6")
+    inset.set_title(f"smallest dihedral angle (min {angles.min():.0f}°)", fontsize=7)
+    inset.tick_params(labelsize=6)
+    inset.set_yticks([])

@@ -1,0 +1,31 @@
+"""What several test modules share."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from brainshift_ros.h5 import digest
+from brainshift_ros.image.template import template_labels, template_landmarks, template_t1
+from brainshift_ros.image.tumor import draw_tumor
+from brainshift_ros.image.volume import Volume
+from brainshift_ros.mesh.build import build_patient
+from brainshift_ros.mesh.patient import ImageReference, PatientModel
+from brainshift_ros.mesh.sheets import septa_from_landmarks
+
+
+@pytest.fixture(scope="session")
+def template_case() -> tuple[Volume, Volume]:
+    """T1 and labels of the template with a tumour, every second voxel along each axis: a real brain, small."""
+    t1, labels = draw_tumor(template_t1(), template_labels(template_landmarks()))
+    T = t1.T_patient_voxel @ np.diag([2.0, 2.0, 2.0, 1.0])
+    return Volume(t1.data[::2, ::2, ::2], T), Volume(labels.data[::2, ::2, ::2], T)
+
+
+@pytest.fixture(scope="session")
+def small_patient(template_case: tuple[Volume, Volume]) -> PatientModel:
+    """A patient model of about 3,000 nodes with tumour and split septa."""
+    t1, labels = template_case
+    image = ImageReference("template.nii.gz", digest(t1.data), t1.shape, t1.T_patient_voxel)
+    septa = septa_from_landmarks(template_landmarks().septa, spacing_mm=9.0)
+    return build_patient(t1, labels, septa, image_ref=image, nodes=3_000)

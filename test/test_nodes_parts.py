@@ -1,0 +1,143 @@
+"""The parts that nodes are made of, without starting one: messages, worker, health, QoS."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from ros_cases import box_mesh, measured_points
+
+from brainshift_ros import graph
+from brainshift_ros.bags import TYPES, to_recordable
+from brainshift_ros.nodes.health import Health, Level
+from brainshift_ros.nodes.messages import message_class, to_message
+from brainshift_ros.nodes.qos import PROFILES
+from brainshift_ros.nodes.worker import Worker
+from brainshift_ros.registration.scan import OrganisedScan
+from brainshift_ros.wire.markers import displacement_markers, surface_marker
+from brainshift_ros.wire.pose import encode_pose, encode_transform
+from brainshift_ros.wire.retraction import encode_blade, encode_columns, encode_retraction_vector
+from brainshift_ros.wire.scan import encode_scan
+from brainshift_ros.wire.vectors import encode_homologous
+
+
+def every_plain():
+    mesh = box_mesh(3)
+    rng = np.random.default_rng(0)
+    points = rng.normal(0.0, 0.1, (4, 5, 3)).astype(np.float32)
+    health = Health("lrs")
+    health.set("scan", Level.WARN, "dim")
+    health.report({"rms_mm": 0.4})
+    return {
+        graph.LRS_POINTS: encode_scan(OrganisedScan(points, rng.integers(0, 256, (4, 5, 3), dtype=np.uint8), "tracker", 5)),
+        graph.LRS_INITIAL_POSE: encode_pose(np.eye(4), 1_500_000_000),
+        graph.REGISTRATION: encode_transform(np.eye(4), 7),
+        graph.HOMOLOGOUS_POINTS: encode_homologous(measured_points(), 8),
+        graph.RETRACTOR_BLADE: encode_blade(np.eye(3), 9),
+        graph.RETRACTOR_DISPLACEMENT: encode_retraction_vector(np.array([0.0, 0.01, 0.0]), 9),
+        graph.ATLAS_RETRACTION: encode_columns(rng.normal(size=(2, 3, 3)).astype(np.float32)),
+        graph.ATLAS_SURFACE: surface_marker(mesh.nodes, mesh.facets["skull"], 10),
+        graph.DISPLACEMENT_MARKERS: displacement_markers(mesh.nodes, mesh.facets["skull"], mesh.nodes * 0.01, 9, 11),
+        graph.DIAGNOSTICS: health.array(12),
+        graph.RETRACTOR_STATUS: health.status(),
+        graph.ATLAS_INFO: {"data": '{"schema": "é"}'},
+    }
+
+
+@pytest.mark.parametrize("topic", every_plain(), ids=lambda topic: topic.name)
+def test_rclpy_and_rosbags_make_the_same_message_of_plain_attributes(topic):
+    plain = every_plain()[topic]
+    travelled = TYPES.deserialize_cdr(serialize_message(to_message(topic.type, plain)), topic.type)
+    # Compared as rosbags serialises them: rclpy leaves chance bytes where CDR pads.
+    sent, recorded = (bytes(TYPES.serialize_cdr(item, topic.type)) for item in (travelled, to_recordable(topic.type, plain)))
+    assert sent == recorded
+    assert len(sent) > 4
+
+
+@pytest.mark.parametrize("topic", graph.TOPICS, ids=lambda topic: topic.name)
+def test_each_topic_has_a_message_class_and_a_profile(topic):
+    assert message_class(topic.type).__name__ == topic.type.split("/")[-1]
+    profile = PROFILES[topic.qos]
+    assert profile.reliability is ReliabilityPolicy.RELIABLE
+    assert (profile.durability is DurabilityPolicy.TRANSIENT_LOCAL) == (topic.qos is graph.Qos.LATCHED)
+    assert profile.depth == (1 if topic.qos is graph.Qos.LATCHED else 10)
+
+
+def test_the_worst_condition_speaks_for_the_node():
+    health = Health("inverse")
+    assert health.worst == (Level.OK, "running")
+    health.set("atlas", Level.OK, "open")
+    health.set("points", Level.ERROR, "points: wrong frame")
+    health.set("estimate", Level.WARN, "few points")
+    status = health.status()
+    assert (status["level"], status["message"]) == (b"\x02", "points: wrong frame")
+    assert {"key": "estimate", "value": "WARN: few points"} in status["values"]
+    assert health.set("points", Level.OK, "1 received") is True
+    assert health.set("points", Level.OK, "1 received") is False
+    assert health.worst == (Level.WARN, "few points")
+
+
+class Executor:
+    """Delivers a worker's results in the test's thread."""
+
+    def __init__(self):
+        self.woken = threading.Semaphore(0)
+        self.worker = Worker(self.woken.release)
+
+    def run(self, jobs):
+        for _ in range(jobs):
+            assert self.woken.acquire(timeout=10)
+        self.worker.deliver()
+
+
+def test_the_newest_waiting_job_of_a_key_wins_and_others_keep_their_order():
+    executor, gate, started, results = Executor(), threading.Event(), threading.Event(), []
+
+    def first():
+        started.set()
+        gate.wait(10)
+        return "first"
+
+    def done(future):
+        results.append((future.result(), threading.current_thread() is threading.main_thread()))
+
+    executor.worker.submit("later", first, done)
+    assert started.wait(10)
+    executor.worker.submit("later", lambda: "older", done)
+    executor.worker.submit("pose", lambda: "pose", done)
+    executor.worker.submit("later", lambda: "newest", done)
+    gate.set()
+    executor.run(3)
+    assert results == [("first", True), ("pose", True), ("newest", True)]
+    executor.worker.stop()
+
+
+def test_an_exception_in_a_job_is_handed_over_and_the_worker_goes_on():
+    executor, results = Executor(), []
+    executor.worker.submit("bad", lambda: 1 / 0, lambda future: results.append(future.exception()))
+    executor.worker.submit("good", lambda: 2, lambda future: results.append(future.result()))
+    executor.run(2)
+    assert isinstance(results[0], ZeroDivisionError)
+    assert results[1] == 2
+    executor.worker.stop()
+
+
+def test_a_stopped_worker_starts_no_waiting_job():
+    executor, gate, started, ran = Executor(), threading.Event(), threading.Event(), []
+
+    def first():
+        started.set()
+        gate.wait(10)
+
+    executor.worker.submit("first", first, lambda future: None)
+    executor.worker.submit("second", lambda: ran.append("second"), lambda future: None)
+    assert started.wait(10)
+    executor.worker.stop()
+    assert executor.worker.busy
+    gate.set()
+    executor.worker.submit("third", lambda: ran.append("third"), lambda future: None)
+    assert not executor.woken.acquire(timeout=0.3)
+    assert ran == []
