@@ -216,6 +216,8 @@ def read_bag(path: str | Path, topics: Sequence[Topic] = graph.TOPICS, require: 
             if not any(item.msgcount for item in chosen if wanted[item.topic] == topic):
                 held = ", ".join(sorted(item.topic for item in reader.connections if item.msgcount)) or "nothing"
                 raise InputError(path, f"holds no message on {topic.name} (it holds {held})", f"record {topic.name} too")
+        if not chosen:
+            return []  # no connections would mean all of them to rosbags
         try:
             found = [Recorded(wanted[item.topic], stamp, bytes(cdr)) for item, stamp, cdr in reader.messages(chosen)]
         except Exception as error:  # as above

@@ -6,18 +6,19 @@ import numpy as np
 import pytest
 
 from brainshift_ros.h5 import digest
-from brainshift_ros.image.template import template_labels, template_landmarks, template_t1
-from brainshift_ros.image.tumor import draw_tumor
+from brainshift_ros.image.template import template_landmarks
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.mesh.build import build_patient
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
 from brainshift_ros.mesh.sheets import septa_from_landmarks
+from brainshift_ros.mesh.template_patient import template_patient_images
 
 
 @pytest.fixture(scope="session")
 def template_case() -> tuple[Volume, Volume]:
     """T1 and labels of the template with a tumour, every second voxel along each axis: a real brain, small."""
-    t1, labels = draw_tumor(template_t1(), template_labels(template_landmarks()))
+    images = template_patient_images()
+    t1, labels = images.t1, images.labels
     T = t1.T_patient_voxel @ np.diag([2.0, 2.0, 2.0, 1.0])
     return Volume(t1.data[::2, ::2, ::2], T), Volume(labels.data[::2, ::2, ::2], T)
 

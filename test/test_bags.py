@@ -167,6 +167,12 @@ def test_a_bag_that_lacks_a_topic_says_which(tmp_path):
         read_bag(tmp_path / "poses", require=[graph.LRS_POINTS])
 
 
+def test_topics_that_a_bag_lacks_are_read_as_nothing(tmp_path):
+    with BagWriter(tmp_path / "poses") as bag:
+        bag.add_initial_pose(np.eye(4), 1)
+    assert read_bag(tmp_path / "poses", [graph.LRS_POINTS]) == []
+
+
 def test_a_topic_of_another_type_is_refused(tmp_path):
     with Writer(tmp_path / "other", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connection = writer.add_connection("/lrs/points", "std_msgs/msg/String", typestore=TYPES)

@@ -71,6 +71,11 @@ def test_a_refused_registration_gives_way_to_a_better_pose_or_scan(session):
     assert refused.registered is None
     assert refused.vessels is None
     assert any("refused" in warning for warning in refused.warnings)
+    far_off = session.set_initial_pose(case.start(0.0, 90.0))
+    assert far_off is not None
+    for update in (refused, far_off):
+        assert "reasons" in update.diagnostics
+        assert all(np.isfinite(value) for value in update.diagnostics.values() if not isinstance(value, str))
     better = session.set_initial_pose(case.start(5.0, 4.0))
     assert better is not None
     assert better.registration is not None

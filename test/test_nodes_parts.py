@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
+import random
 import threading
+from collections import Counter
 
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from ros_cases import box_mesh, measured_points
 
 from brainshift_ros import graph
 from brainshift_ros.bags import TYPES, to_recordable
+from brainshift_ros.errors import InputError
 from brainshift_ros.nodes.health import Health, Level
 from brainshift_ros.nodes.messages import message_class, to_message
 from brainshift_ros.nodes.qos import PROFILES
 from brainshift_ros.nodes.worker import Worker
 from brainshift_ros.registration.scan import OrganisedScan
 from brainshift_ros.wire.markers import displacement_markers, surface_marker
-from brainshift_ros.wire.pose import encode_pose, encode_transform
-from brainshift_ros.wire.retraction import encode_blade, encode_columns, encode_retraction_vector
-from brainshift_ros.wire.scan import encode_scan
-from brainshift_ros.wire.vectors import encode_homologous
+from brainshift_ros.wire.pose import decode_pose, encode_pose, encode_transform
+from brainshift_ros.wire.retraction import (
+    decode_blade,
+    decode_columns,
+    decode_retraction_vector,
+    encode_blade,
+    encode_columns,
+    encode_retraction_vector,
+)
+from brainshift_ros.wire.scan import decode_scan, encode_scan
+from brainshift_ros.wire.vectors import decode_homologous, encode_homologous
 
 
 def every_plain():
@@ -55,6 +65,40 @@ def test_rclpy_and_rosbags_make_the_same_message_of_plain_attributes(topic):
     sent, recorded = (bytes(TYPES.serialize_cdr(item, topic.type)) for item in (travelled, to_recordable(topic.type, plain)))
     assert sent == recorded
     assert len(sent) > 4
+
+
+DECODERS = {
+    graph.LRS_POINTS: decode_scan,
+    graph.LRS_INITIAL_POSE: decode_pose,
+    graph.HOMOLOGOUS_POINTS: decode_homologous,
+    graph.RETRACTOR_BLADE: decode_blade,
+    graph.RETRACTOR_DISPLACEMENT: decode_retraction_vector,
+    graph.ATLAS_RETRACTION: decode_columns,
+}
+
+
+@pytest.mark.parametrize("topic", DECODERS, ids=lambda topic: topic.name)
+def test_damaged_bytes_either_fail_to_deserialise_or_are_checked(topic):
+    """What a node does with each message; the process must survive, whatever the bytes are."""
+    plain = every_plain()[topic]
+    whole = bytes(TYPES.serialize_cdr(to_recordable(topic.type, plain), topic.type))
+    rng = random.Random(topic.name)
+    outcomes = Counter()
+    for _ in range(300):
+        damaged = bytearray(whole)
+        for _ in range(rng.randint(1, 4)):
+            damaged[rng.randrange(min(len(damaged), 200))] = rng.choice([0, 255, rng.randrange(256)])
+        try:
+            message = deserialize_message(bytes(damaged[: rng.randint(4, 2 * len(damaged))]), message_class(topic.type))
+        except Exception:
+            outcomes["unreadable"] += 1
+            continue
+        try:
+            DECODERS[topic](message)
+            outcomes["good"] += 1
+        except InputError:
+            outcomes["refused"] += 1
+    assert min(outcomes[name] for name in ("unreadable", "good", "refused")) > 0, outcomes
 
 
 @pytest.mark.parametrize("topic", graph.TOPICS, ids=lambda topic: topic.name)

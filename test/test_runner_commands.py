@@ -107,6 +107,19 @@ def test_tools_say_what_is_wrong_in_one_line(arguments, fault):
 
 
 @pytest.mark.integration
+def test_replay_says_when_nobody_listens(tmp_path):
+    with BagWriter(tmp_path / "poses") as bag:
+        bag.add_initial_pose(np.eye(4), 1)
+    done = tool("replay", str(tmp_path / "poses"), "--wait", "0.2")
+    assert done.returncode == 0
+    assert "fewer than 1 subscribers of lrs/initial_pose after 0.2 s" in done.stderr
+    assert "published 1 messages" in done.stdout
+    nothing = tool("replay", str(tmp_path / "poses"), "--topic", "lrs/points")
+    assert nothing.returncode == 2
+    assert "holds no message on lrs/points" in nothing.stderr
+
+
+@pytest.mark.integration
 def test_a_recording_that_lacks_its_goal_ends_with_status_3(tmp_path):
     done = tool("record", str(tmp_path / "bag"), "--topic", "lrs/points", "--until", "lrs/points:2", "--timeout", "0.5")
     assert done.returncode == 3

@@ -140,6 +140,8 @@ class LrsSession:
             "registration_iterations": float(result.iterations),
         }
         times = {f"registration_{stage}": seconds for stage, seconds in result.times_s.items()}
+        # Where nothing matched, RMS and conditioning do not exist: nothing that is not finite leaves the session.
+        diagnostics = {name: value for name, value in diagnostics.items() if isinstance(value, str) or np.isfinite(value)}
         if not result.accepted:
             diagnostics["reasons"] = "; ".join(result.reasons)
             refused = tuple(f"registration refused: {reason}" for reason in result.reasons)

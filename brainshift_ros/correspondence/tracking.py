@@ -20,8 +20,10 @@ from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import invert_rigid, transform_points
 from brainshift_ros.registration.opening import pixel_spacing
 from brainshift_ros.registration.scan import OrganisedScan
+from brainshift_ros.units import mm_to_m
 
 _SPREAD_M = 6e-3
+_RIM_M = 0.8e-3
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ def prepare_first(scan: OrganisedScan, cortex_mask: NDArray[np.bool_], options: 
     """
     options = options or TrackingOptions()
     cell = max(0.2e-3, pixel_spacing(scan))
-    grid = grid_over(scan.points[cortex_mask & scan.seen].astype(np.float64), cell, margin_m=options.reach_mm * 1e-3)
+    grid = grid_over(scan.points[cortex_mask & scan.seen].astype(np.float64), cell, margin_m=float(mm_to_m(options.reach_mm)))
     view = view_scan(scan, grid)
     inside = covered_cells(scan, grid, cortex_mask)
     size = 2 * max(1, round(1e-3 / cell)) + 1
@@ -140,7 +142,7 @@ def track(first: FirstView, later_scan: OrganisedScan, options: TrackingOptions 
     times = {"resample": time.perf_counter() - clock}
 
     clock = time.perf_counter()
-    coarse = match_coarsely(first.view, later, first.region, cell, options.reach_mm * 1e-3)
+    coarse = match_coarsely(first.view, later, first.region, cell, float(mm_to_m(options.reach_mm)))
     times["coarse"] = time.perf_counter() - clock
 
     clock = time.perf_counter()
@@ -188,10 +190,12 @@ def _choose_candidates(
 ) -> NDArray[np.float64]:
     """Two-dimensional structure on vessels (branches, bends, crossings), strongest first, at least a spacing apart."""
     strength = vesselness(view.texture * 0.15, cell)
-    window = 2 * round(0.5e-3 * options.window_mm / cell) + 1
+    window = 2 * round(0.5 * float(mm_to_m(options.window_mm)) / cell) + 1
     corner = cv2.cornerMinEigenVal(cv2.GaussianBlur(view.texture, (0, 0), 0.35e-3 / cell), window, ksize=3)
     on_vessel = cv2.dilate((strength > 0.04).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    border = 2 * round((0.5e-3 * options.window_mm + 0.8e-3) / cell) + 1  # the rim hides and bares cortex as it moves
+    border = (
+        2 * round((0.5 * float(mm_to_m(options.window_mm)) + _RIM_M) / cell) + 1
+    )  # the rim hides and bares cortex as it moves
     inner = cv2.erode(region.astype(np.uint8), np.ones((border, border), np.uint8)) > 0
     corner = np.where(on_vessel & inner & view.seen, corner, 0.0)
     if corner.max() <= 0:
@@ -199,7 +203,7 @@ def _choose_candidates(
     corner[corner < 0.01 * np.quantile(corner[corner > 0], 0.99)] = 0.0
     # Strength is judged against the surroundings, so that a bundle of vessels does not take all the points.
     corner = corner / np.sqrt(cv2.GaussianBlur(corner, (0, 0), _SPREAD_M / cell) + 1e-12)
-    radius = options.spacing_mm * 1e-3 / cell
+    radius = float(mm_to_m(options.spacing_mm)) / cell
     rows, columns = np.nonzero(corner)
     order = np.argsort(-corner[rows, columns], kind="stable")
     free = np.ones(corner.shape, dtype=np.uint8)
@@ -233,7 +237,7 @@ def _track_finely(first: FirstView, later: PlaneView, coarse: CoarseShift, optio
     a, b = (np.clip(128.0 + 31.0 * view.texture, 0, 255).astype(np.uint8) for view in (first.view, later))
     start = first.candidates.astype(np.float32)
     guess = (start + coarse.at(first.candidates)).astype(np.float32)
-    side = 2 * round(0.5e-3 * options.window_mm / cell) + 1
+    side = 2 * round(0.5 * float(mm_to_m(options.window_mm)) / cell) + 1
 
     def lucas_kanade(
         source: NDArray, target: NDArray, points: NDArray[np.float32], start_from: NDArray[np.float32]
@@ -253,7 +257,7 @@ def _track_finely(first: FirstView, later: PlaneView, coarse: CoarseShift, optio
     end, found = lucas_kanade(a, b, start, guess)
     back, found_back = lucas_kanade(b, a, end, start + (end - guess))
     loop = np.linalg.norm(back - start, axis=1) * cell
-    good = found & found_back & (loop < options.forward_backward_mm * 1e-3)
+    good = found & found_back & (loop < float(mm_to_m(options.forward_backward_mm)))
     tracks = []
     for k in np.flatnonzero(good):
         evidence = _window_evidence(first.view, later, start[k], end[k], side, cell)

@@ -10,6 +10,7 @@ import pyvista as pv
 from numpy.typing import NDArray
 
 from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.mesh.surfacing import polydata
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def side_of_sheet(sheet: Surface, points: NDArray[np.float64]) -> SideOfSheet:
 
 def merged(sheets: list[Surface]) -> Surface:
     """Join sheets into one, with vertices at the same place made one, so that they meet without an edge between."""
-    poly = pv.merge([pv.PolyData.from_regular_faces(s.vertices, s.faces.astype(np.int64)) for s in sheets], merge_points=False)
+    poly = pv.merge([polydata(s) for s in sheets], merge_points=False)
     poly = poly.extract_surface(algorithm=None).clean(tolerance=1e-7, absolute=True)
     return Surface(np.asarray(poly.points, dtype=np.float64), np.asarray(poly.regular_faces, dtype=np.int32))
 

@@ -28,7 +28,8 @@ class SplitMesh:
     elements
         Shape (M, 4), in the order of the mesh before.
     facets
-        For each sheet name the facets of *both* sides, each pointing out of its element.
+        For each sheet name the facets of *both* sides, each pointing out of its element: first all of the side that
+        the sheet's normals leave (left of the falx, under the tentorium), then, in the same order, those opposite.
     rims
         For each sheet name the nodes of its free edge, which both sides share.
     """
@@ -64,32 +65,50 @@ def split_along_septa(nodes: NDArray[np.float64], elements: NDArray[np.int32], s
     """
     table = face_table(elements)
     cut_by = _cut_faces(nodes, elements, table, sheet_surfaces(septa))
-    cut = np.zeros(len(table.interior), dtype=bool)
-    for faces in cut_by.values():
-        cut |= faces
-    new_nodes, new_elements = _double_nodes(nodes, elements, table, cut)
+    every_cut = np.concatenate([np.empty(0, dtype=np.int64), *(cut.faces for cut in cut_by.values())])
+    if len(every_cut) == 0:
+        empty = np.empty((0, 3), dtype=np.int32)
+        return SplitMesh(nodes, elements, dict.fromkeys(cut_by, empty), dict.fromkeys(cut_by, empty[:, 0]))
+    new_nodes, new_elements = _double_nodes(nodes, elements, table, every_cut)
     facets, rims = {}, {}
-    outer = np.unique(table.boundary)
-    for name, faces in cut_by.items():
-        facets[name] = _both_sides(table, faces, elements, new_elements)
-        rims[name] = _rim(table.interior[faces], outer)
+    for name, cut in cut_by.items():
+        below, above = (
+            _facets_of(table.interior[cut.faces], owner, elements, new_elements) for owner in (cut.below, cut.above)
+        )
+        outward = table.owners[cut.faces, 0] == cut.below
+        below, above = _turned(below, ~outward), _turned(above, outward)
+        # A lone facet at a sheet's tip, with all its nodes on the free edge, parts nothing.
+        parted = np.any(np.sort(below, axis=1) != np.sort(above, axis=1), axis=1)
+        facets[name] = np.vstack([below[parted], above[parted]])
+        rims[name] = _rim(below[parted], above[parted])
     return SplitMesh(new_nodes, new_elements, facets, rims)
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """Faces, as rows of the face table's interior faces, and the elements below and above each."""
+
+    faces: NDArray[np.int64]
+    below: NDArray[np.int64]
+    above: NDArray[np.int64]
 
 
 def _cut_faces(
     nodes: NDArray[np.float64], elements: NDArray[np.int32], table: FaceTable, sheets: Mapping[str, Surface]
-) -> dict[str, NDArray[np.bool_]]:
+) -> dict[str, _Cut]:
     centres = nodes[elements].mean(axis=1)
     face_centres = nodes[table.interior].mean(axis=1)
-    cut_by: dict[str, NDArray[np.bool_]] = {}
+    cut_by: dict[str, _Cut] = {}
     taken = np.zeros(len(table.interior), dtype=bool)
     for name, surface in sheets.items():
         side = side_of_sheet(surface, centres).height >= 0.0
         beside = side_of_sheet(surface, face_centres).overshoot <= EDGE_TOLERANCE_M
         side = _without_pockets(side, beside, table)
-        cut = (side[table.owners[:, 0]] != side[table.owners[:, 1]]) & beside & ~taken
-        cut_by[name] = cut
-        taken |= cut
+        first, second = side[table.owners].T
+        faces = np.flatnonzero((first != second) & beside & ~taken)
+        one, two = table.owners[faces].T
+        cut_by[name] = _Cut(faces, np.where(side[one], two, one), np.where(side[one], one, two))
+        taken[faces] = True
     return cut_by
 
 
@@ -109,8 +128,10 @@ def _without_pockets(side: NDArray[np.bool_], beside: NDArray[np.bool_], table: 
 
 
 def _double_nodes(
-    nodes: NDArray[np.float64], elements: NDArray[np.int32], table: FaceTable, cut: NDArray[np.bool_]
+    nodes: NDArray[np.float64], elements: NDArray[np.int32], table: FaceTable, cut_faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    cut = np.zeros(len(table.interior), dtype=bool)
+    cut[cut_faces] = True
     on_cut = np.zeros(len(nodes), dtype=bool)
     on_cut[table.interior[cut].ravel()] = True
     # Corners are (element, local vertex) pairs; uncut faces join the corners of their two elements at shared nodes.
@@ -135,21 +156,23 @@ def _double_nodes(
     return np.vstack([nodes, nodes[copies[~first, 0]]]), new_elements.reshape(elements.shape).astype(np.int32)
 
 
-def _both_sides(
-    table: FaceTable, cut: NDArray[np.bool_], elements: NDArray[np.int32], new_elements: NDArray[np.int32]
+def _facets_of(
+    faces: NDArray[np.int32], owner: NDArray[np.int64], elements: NDArray[np.int32], new_elements: NDArray[np.int32]
 ) -> NDArray[np.int32]:
-    sides = []
-    for side, turned in ((0, slice(None)), (1, slice(None, None, -1))):
-        owner = table.owners[cut, side]
-        local = np.argmax(elements[owner][:, None, :] == table.interior[cut][:, turned][:, :, None], axis=2)
-        sides.append(np.take_along_axis(new_elements[owner], local, axis=1))
-    return np.vstack(sides).astype(np.int32)
+    """Faces, given by the nodes before, with the copies of their nodes that their owner uses."""
+    local = np.argmax(elements[owner][:, None, :] == faces[:, :, None], axis=2)
+    return np.take_along_axis(new_elements[owner], local, axis=1).astype(np.int32)
 
 
-def _rim(faces: NDArray[np.int32], outer: NDArray) -> NDArray[np.int32]:
-    """Nodes of edges that belong to one cut face only and do not lie on the outer boundary."""
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    unique, count = np.unique(edges, axis=0, return_counts=True)
-    free = unique[count == 1]
-    free = free[~np.isin(free, outer).all(axis=1)]
-    return np.unique(free).astype(np.int32)
+def _turned(faces: NDArray[np.int32], turn: NDArray[np.bool_]) -> NDArray[np.int32]:
+    return np.where(turn[:, None], faces[:, ::-1], faces)
+
+
+def _rim(below: NDArray[np.int32], above: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Nodes of the edges that both sides of a sheet share: there it ends inside the tissue.
+
+    Where it ends on the skull or on another sheet, each side has its own copies.
+    """
+    edges = [np.unique(np.sort(side[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0) for side in (below, above)]
+    both, count = np.unique(np.vstack(edges), axis=0, return_counts=True)
+    return np.unique(both[count == 2]).astype(np.int32)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
@@ -49,19 +51,19 @@ def isosurface(field: NDArray[np.float32], level: float, T_patient_voxel: NDArra
 
 def smooth_taubin(surface: Surface, iterations: int = 30, pass_band: float = 0.05) -> Surface:
     """Smooth with a windowed-sinc low-pass filter, which keeps the volume (Taubin, Zhang, Golub 1996)."""
-    return _surface(_polydata(surface).smooth_taubin(n_iter=iterations, pass_band=pass_band))
+    return _surface(polydata(surface).smooth_taubin(n_iter=iterations, pass_band=pass_band))
 
 
 def smooth_laplacian(surface: Surface, iterations: int = 30, relaxation: float = 0.2) -> Surface:
     """Smooth by moving vertices to the mean of their neighbours, as the thesis does; it shrinks."""
-    return _surface(_polydata(surface).smooth(n_iter=iterations, relaxation_factor=relaxation))
+    return _surface(polydata(surface).smooth(n_iter=iterations, relaxation_factor=relaxation))
 
 
 def decimate(surface: Surface, faces: int) -> Surface:
     """Reduce to about `faces` triangles by quadric error (Garland and Heckbert 1997); smaller surfaces stay as they are."""
     if len(surface.faces) <= faces:
         return surface
-    return _surface(_polydata(surface).decimate(1.0 - faces / len(surface.faces)))
+    return _surface(polydata(surface).decimate(1.0 - faces / len(surface.faces)))
 
 
 def enclosed_volume(surface: Surface) -> float:
@@ -76,8 +78,10 @@ def face_areas(surface: Surface) -> NDArray[np.float64]:
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
-def _polydata(surface: Surface) -> pv.PolyData:
-    return pv.PolyData.from_regular_faces(surface.vertices, surface.faces.astype(np.int64))
+def polydata(surface: Surface) -> pv.PolyData:
+    """Wrap a surface as VTK's data structure."""
+    faces: Any = surface.faces.astype(np.int64)  # PyVista's annotation knows no NumPy integer
+    return pv.PolyData.from_regular_faces(surface.vertices, faces)
 
 
 def _surface(polydata: pv.PolyData) -> Surface:

@@ -23,23 +23,27 @@ from brainshift_ros.nodes.stopping import ros_until_stopped
 from brainshift_ros.nodes.tool import run_tool
 from brainshift_ros.wire.plain import NS_PER_S
 
-#: Discovery takes 0.25 s, 3.3 s at worst; this is when to stop waiting for a subscriber.
-MATCH_LIMIT_S = 10.0
+#: How long subscribers may take to acknowledge the last message.
+ACKNOWLEDGE_LIMIT_S = 10.0
 POLL_S = 0.02
 
 
-def publish_bag(node: Node, recorded: Sequence[Recorded], *, rate: float, subscribers: int, stop: threading.Event) -> None:
+def publish_bag(
+    node: Node, recorded: Sequence[Recorded], *, rate: float, subscribers: int, wait_s: float, stop: threading.Event
+) -> None:
     """Publish recorded messages, byte for byte, at `rate` times the speed of their recording.
 
-    Publishing starts when each topic has `subscribers` subscribers, and ends when all of them have acknowledged.
+    Publishing starts when each topic has `subscribers` subscribers or `wait_s` has passed, and ends when all of them have
+    acknowledged.
     """
     topics = {message.topic.name: message.topic for message in recorded}
     publishers = {
         name: node.create_publisher(message_class(topic.type), name, PROFILES[topic.qos]) for name, topic in topics.items()
     }
-    unmatched = _unmatched_after_limit(publishers, subscribers, stop)
+    unmatched = _unmatched_after_limit(publishers, subscribers, wait_s, stop)
     if unmatched:
-        print(f"nobody takes {', '.join(unmatched)}; is the graph running in this ROS_DOMAIN_ID?", file=sys.stderr)
+        few = f"fewer than {subscribers} subscribers of {', '.join(unmatched)} after {wait_s:g} s, publishing all the same"
+        print(f"{few}; is the graph running in this ROS_DOMAIN_ID?", file=sys.stderr)
     begin, first = time.monotonic(), recorded[0].stamp_ns
     for message in recorded:
         due = begin + (message.stamp_ns - first) / NS_PER_S / rate
@@ -47,12 +51,12 @@ def publish_bag(node: Node, recorded: Sequence[Recorded], *, rate: float, subscr
             return
         publishers[message.topic.name].publish(message.cdr)
     for publisher in publishers.values():
-        publisher.wait_for_all_acked(Duration(seconds=MATCH_LIMIT_S))
+        publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE_LIMIT_S))
     print(f"published {len(recorded)} messages", flush=True)
 
 
-def _unmatched_after_limit(publishers: dict[str, Any], subscribers: int, stop: threading.Event) -> list[str]:
-    deadline = time.monotonic() + MATCH_LIMIT_S
+def _unmatched_after_limit(publishers: dict[str, Any], subscribers: int, wait_s: float, stop: threading.Event) -> list[str]:
+    deadline = time.monotonic() + wait_s
     while True:
         waiting = [name for name, publisher in publishers.items() if publisher.get_subscription_count() < subscribers]
         if not waiting or time.monotonic() > deadline or stop.wait(POLL_S):
@@ -64,8 +68,16 @@ def _unmatched_after_limit(publishers: dict[str, Any], subscribers: int, stop: t
 @click.option("--rate", type=click.FloatRange(0.0, min_open=True), default=1.0, show_default=True, help="speed factor")
 @click.option("--topic", "names", multiple=True, help="publish this topic instead of the case's inputs (repeatable)")
 @click.option("--subscribers", type=click.IntRange(0), default=1, show_default=True, help="wait for so many on each topic")
+@click.option(
+    "--wait",
+    "wait_s",
+    type=click.FloatRange(0.0),
+    default=60.0,
+    show_default=True,
+    help="for so many seconds at most: nodes may still be starting",
+)
 @click.option("--stay", is_flag=True, help="keep latched topics alive until interrupted")
-def command(bag: Path, rate: float, names: tuple[str, ...], subscribers: int, stay: bool) -> None:
+def command(bag: Path, rate: float, names: tuple[str, ...], subscribers: int, wait_s: float, stay: bool) -> None:
     """Publish the recorded inputs of a case: scans, pose, blade."""
     topics = graph.topics_named(names) or graph.CASE_INPUTS
     recorded = read_bag(bag, topics)
@@ -73,7 +85,8 @@ def command(bag: Path, rate: float, names: tuple[str, ...], subscribers: int, st
         wanted = ", ".join(topic.name for topic in topics)
         raise InputError(bag, f"holds no message on {wanted}", "record a case, or choose a topic by --topic")
     with ros_until_stopped() as stop:
-        publish_bag(rclpy.create_node("replay"), recorded, rate=rate, subscribers=subscribers, stop=stop)
+        node = rclpy.create_node("replay")
+        publish_bag(node, recorded, rate=rate, subscribers=subscribers, wait_s=wait_s, stop=stop)
         if stay:
             stop.wait()
 

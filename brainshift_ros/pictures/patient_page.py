@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pyvista as pv
@@ -11,6 +12,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
@@ -19,6 +21,8 @@ from brainshift_ros.image.resample import sample
 from brainshift_ros.image.volume import Region, Volume
 from brainshift_ros.mesh.patient import PatientModel, Tissue
 from brainshift_ros.mesh.quality import dihedral_angles_deg
+from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.mesh.surfacing import polydata
 from brainshift_ros.units import m_to_mm, mm_to_m
 
 SEPTA_COLOURS = {"falx": "#ff9d00", "tentorium": "#e5006d"}
@@ -52,8 +56,7 @@ def patient_page(patient: PatientModel, t1: Volume, path: str | Path) -> None:
         draw_slice(axes_2d, patient, t1, axis, at)
     draw_cut(axes[1][0], patient, 1, centre[1])
     draw_cut(axes[1][1], patient, 2, centre[2])
-    space = figure.add_subplot(2, 3, 6, projection="3d")
-    _draw_septa_in_space(space, patient)
+    _draw_septa_in_space(cast(Axes3D, figure.add_subplot(2, 3, 6, projection="3d")), patient)
     _inset_quality(axes[1][1], patient)
     handles = [Patch(color=colour, label=region.name.lower().replace("_", " ")) for region, colour in REGION_COLOURS.items()]
     handles += [Patch(color=colour, label=name) for name, colour in SEPTA_COLOURS.items() if name in patient.mesh.facets]
@@ -69,11 +72,11 @@ def draw_slice(axes: Axes, patient: PatientModel, t1: Volume, axis: int, at: flo
     u, v = (np.arange(low[k], high[k], 0.001) for k in (first, second))
     points = np.zeros((len(v), len(u), 3))
     points[..., axis], points[..., first], points[..., second] = at, u[None, :], v[:, None]
-    extent = (m_to_mm(u[0]), m_to_mm(u[-1]), m_to_mm(v[0]), m_to_mm(v[-1]))
+    extent = (float(m_to_mm(u[0])), float(m_to_mm(u[-1])), float(m_to_mm(v[0])), float(m_to_mm(v[-1])))
     axes.imshow(sample(t1, points), cmap="gray", origin="lower", extent=extent)
     section = _section(patient, axis, at)
     for region, colour in REGION_COLOURS.items():
-        cells = section.extract_cells(np.flatnonzero(section.cell_data["region"] == region))
+        cells = section.extract_cells(section.cell_data["region"] == region)
         edges = cells.extract_surface(algorithm=None).extract_feature_edges(
             boundary_edges=True, feature_edges=False, manifold_edges=False, non_manifold_edges=False
         )
@@ -117,15 +120,15 @@ def _draw_septa_lines(axes: Axes, patient: PatientModel, axis: int, at: float) -
     first, second = (k for k in range(3) if k != axis)
     for name, colour in SEPTA_COLOURS.items():
         if name in patient.mesh.facets:
-            sheet = pv.PolyData.from_regular_faces(patient.mesh.nodes, patient.mesh.facets[name].astype(np.int64))
+            sheet = polydata(Surface(patient.mesh.nodes, patient.mesh.facets[name]))
             lines = sheet.slice(normal=np.eye(3)[axis], origin=np.eye(3)[axis] * (at + 5e-7))
             axes.add_collection(LineCollection(_segments(lines, first, second), colors=colour, linewidths=2.2))
 
 
-def _segments(lines: pv.PolyData, first: int, second: int) -> NDArray[np.float64]:
+def _segments(lines: pv.PolyData, first: int, second: int) -> list[NDArray[np.float64]]:
     if lines.n_cells == 0:
-        return np.empty((0, 2, 2))
-    return m_to_mm(lines.points[:, [first, second]])[lines.lines.reshape(-1, 3)[:, 1:]]
+        return []
+    return list(m_to_mm(lines.points[:, [first, second]])[lines.lines.reshape(-1, 3)[:, 1:]])
 
 
 def _name_plane(axes: Axes, axis: int, at: float) -> None:
@@ -135,7 +138,7 @@ def _name_plane(axes: Axes, axis: int, at: float) -> None:
     axes.set_ylabel(f"{vertical} (mm, RAS)")
 
 
-def _draw_septa_in_space(axes: Axes, patient: PatientModel) -> None:
+def _draw_septa_in_space(axes: Axes3D, patient: PatientModel) -> None:
     mesh = patient.mesh
     skull = mesh.facets["skull"]
     shown = skull[mesh.nodes[skull].mean(axis=1)[:, 0] > mm_to_m(2.0)]
@@ -159,7 +162,7 @@ def _draw_septa_in_space(axes: Axes, patient: PatientModel) -> None:
 def _inset_quality(axes: Axes, patient: PatientModel) -> None:
     angles = dihedral_angles_deg(patient.mesh.nodes, patient.mesh.elements).min(axis=1)
     inset = axes.inset_axes((1.06, 0.05, 0.3, 0.2))
-    inset.hist(angles, bins=np.arange(0, 73, 3), color="#5b7fa6")
+    inset.hist(angles, bins=24, range=(0.0, 72.0), color="#5b7fa6")
     inset.set_title(f"smallest dihedral angle (min {angles.min():.0f}°)", fontsize=7)
     inset.tick_params(labelsize=6)
     inset.set_yticks([])

@@ -1,0 +1,75 @@
+"""`brainshift patient`: from files to a patient file, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.spatial import cKDTree
+
+from brainshift_ros.cli.patient import command
+from brainshift_ros.errors import InputError
+from brainshift_ros.files import sha256_of_file
+from brainshift_ros.image.io import write_volume
+from brainshift_ros.image.volume import Region, Volume
+from brainshift_ros.mesh.patient import PatientModel
+from brainshift_ros.mesh.patient_file import read_patient
+
+
+def run(*arguments: object) -> None:
+    CliRunner().invoke(command, [str(a) for a in arguments], catch_exceptions=False, standalone_mode=False)
+
+
+def test_labels_and_tumour_mask_make_a_patient_without_septa(
+    tmp_path: Path, template_case: tuple[Volume, Volume], small_patient: PatientModel
+) -> None:
+    t1, labels = template_case
+    tumor = labels.data == Region.TUMOR
+    healthy = np.where(tumor, Region.LEFT_CEREBRUM, labels.data).astype(np.uint8)
+    window = tuple(slice(axis.min() - 3, axis.max() + 4) for axis in np.nonzero(tumor))
+    T_mask = t1.T_patient_voxel.copy()
+    T_mask[:3, 3] += T_mask[:3, :3] @ [axis.start for axis in window]
+    write_volume(tmp_path / "t1.nii.gz", t1)
+    write_volume(tmp_path / "labels.nii.gz", Volume(healthy, t1.T_patient_voxel))
+    write_volume(tmp_path / "tumor.nii.gz", Volume(tumor[window], T_mask))  # on a grid of its own
+    output = tmp_path / "patient.h5"
+    options = ("--labels", tmp_path / "labels.nii.gz", "--tumor", tmp_path / "tumor.nii.gz", "--nodes", 2000, "--seed", 1)
+
+    run(tmp_path / "t1.nii.gz", *options, "-o", output)
+
+    patient = read_patient(output)
+    mesh = patient.mesh
+    assert patient.image.sha256 == sha256_of_file(tmp_path / "t1.nii.gz")
+    assert 0.8 * 2000 < len(mesh.nodes) < 1.2 * 2000
+    assert set(mesh.facets) == {"skull", "tumor"}
+    assert any("septa" in warning for warning in patient.warnings)
+    assert len(cKDTree(mesh.nodes).query_pairs(1e-9)) == 0
+    # the same tumour as that drawn into the labels, in another mesh of the same brain
+    other = small_patient.mesh
+    volume = mesh.volumes[mesh.region == Region.TUMOR].sum()
+    assert volume == pytest.approx(other.volumes[other.region == Region.TUMOR].sum(), rel=0.02)
+    distance, _ = cKDTree(other.nodes).query(mesh.nodes)
+    assert np.median(distance) > 0.001
+
+
+def test_what_cannot_be_done_is_said(tmp_path: Path, template_case: tuple[Volume, Volume]) -> None:
+    t1, labels = template_case
+    write_volume(tmp_path / "t1.nii.gz", t1)
+    write_volume(tmp_path / "labels.nii.gz", labels)
+    target = ("-o", tmp_path / "p.h5")
+    given = (tmp_path / "t1.nii.gz", "--labels", tmp_path / "labels.nii.gz")
+    with pytest.raises(InputError, match="no label image was given"):
+        run(tmp_path / "t1.nii.gz", *target)
+    with pytest.raises(InputError, match="no such file"):
+        run(tmp_path / "other.nii.gz", *target)
+    with pytest.raises(InputError, match="its folder does not exist"):
+        run(*given, "-o", tmp_path / "nowhere" / "p.h5")
+    with pytest.raises(InputError, match="septa cannot be found"):
+        run(*given, "--septa", "auto", *target)
+    with pytest.raises(InputError, match="no such file"):
+        run(*given, "--septa", tmp_path / "septa.yaml", *target)
+    with pytest.raises(InputError, match="holds values other than"):
+        run(tmp_path / "t1.nii.gz", "--labels", tmp_path / "t1.nii.gz", *target)
+    assert not (tmp_path / "p.h5").exists()
