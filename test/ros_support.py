@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import tempfile
 import time
+from pathlib import Path
 
 import rclpy
 from rclpy.context import Context
@@ -17,6 +19,8 @@ from brainshift_ros.runner import ros_environment
 # Before the first participant of this process: Fast DDS reads its profile once.
 os.environ.update({name: ros_environment()[name] for name in ("FASTDDS_DEFAULT_PROFILES_FILE", "AMENT_PREFIX_PATH")})
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+# Nodes of tests keep out of the user's ~/.ros.
+os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "brainshift_ros_test_logs")
 
 #: Generous: on a loaded machine a node needs several seconds to import what it computes with.
 LIMIT_S = 60.0

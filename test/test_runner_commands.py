@@ -26,6 +26,11 @@ from brainshift_ros.runner import ros_environment
 BRAINSHIFT = [sys.executable, "-m", "brainshift_ros.cli.main"]
 
 
+@pytest.fixture(autouse=True)
+def logs_stay_here(monkeypatch, tmp_path_factory):
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("logs")))
+
+
 def box_patient():
     mesh = box_mesh()
     cortex = Surface(mesh.nodes, mesh.facets["skull"])

@@ -19,7 +19,7 @@ from brainshift_ros.mesh.cortex import cortical_surface
 from brainshift_ros.mesh.facets import compact, components, face_table, facet_areas
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
 from brainshift_ros.mesh.patient_file import patient_digest
-from brainshift_ros.mesh.quality import element_quality, refuse_bad_mesh, relative_error_percent
+from brainshift_ros.mesh.quality import element_quality, faults, refuse_bad_mesh, relative_error_percent
 from brainshift_ros.mesh.sheets import Septum
 from brainshift_ros.mesh.side import side_of_sheet
 from brainshift_ros.mesh.sizing import edge_length_for, inside_surface, size_field
@@ -38,6 +38,9 @@ NODES_RANGE = (2_000, 200_000)
 
 #: Distance, in edge lengths, by which a meshed surface may miss the given one.
 ENVELOPE = 0.2
+
+#: How often to mesh, each time in another frame, before a mesh that fails the gate is refused: the mesher is random.
+ATTEMPTS = 3
 
 
 @dataclass(frozen=True)
@@ -92,11 +95,14 @@ def build_patient(
     brain = labels.data > 0
     t1, labels = cropped(t1, brain, margin=3), cropped(labels, brain, margin=3)
     shapes = _shapes(labels, tuple(septa), nodes)
-    report("mesh", 0.0)
-    points, elements = _tetrahedra(shapes, nodes, seed, report)
-    report("septa", 0.0)
-    mesh = _named_mesh(points, elements, shapes, labels)
-    quality = {**element_quality(mesh), **_against_shapes(mesh, shapes, labels)}
+    for attempt in range(ATTEMPTS):
+        report("mesh", 0.0)
+        points, elements = _tetrahedra(shapes, nodes, np.random.default_rng([seed, attempt]), report)
+        report("septa", 0.0)
+        mesh = _named_mesh(points, elements, shapes, labels)
+        quality = {**element_quality(mesh), **_against_shapes(mesh, shapes, labels)}
+        if not faults(quality):
+            break
     refuse_bad_mesh(quality)
     report("tissue", 0.0)
     tissue = classify_tissue(mesh, t1)
@@ -128,9 +134,11 @@ def _with_edges(surface: Surface, edge_length: float) -> Surface:
     return decimate(surface, int(face_areas(surface).sum() / (0.433 * edge_length**2)))
 
 
-def _tetrahedra(shapes: _Shapes, nodes: int, seed: int, report: Progress) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _tetrahedra(
+    shapes: _Shapes, nodes: int, rng: np.random.Generator, report: Progress
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     centre = shapes.brain.vertices.mean(axis=0)
-    turn = Rotation.from_rotvec(0.2 * np.random.default_rng(seed).normal(size=3))
+    turn = Rotation.from_rotvec(0.2 * rng.normal(size=3))
     T_mesher_patient = rigid(turn, centre - turn.apply(centre))
 
     def turned(surface: Surface) -> Surface:

@@ -59,6 +59,15 @@ def relative_error_percent(value: float, reference: float) -> float:
     return 100.0 * abs(value - reference) / reference
 
 
+def faults(quality: Mapping[str, float]) -> tuple[str, ...]:
+    """Say which figures of :data:`LIMITS` lie outside their limits; figures that are not there pass."""
+    return tuple(
+        f"{name} is {quality[name]:.4g} (allowed: {low:g} to {high:g})"
+        for name, (low, high) in LIMITS.items()
+        if name in quality and not low <= quality[name] <= high
+    )
+
+
 def refuse_bad_mesh(quality: Mapping[str, float], source: object = "mesh") -> None:
     """Raise unless every figure of :data:`LIMITS` that is present lies within its limits.
 
@@ -67,10 +76,5 @@ def refuse_bad_mesh(quality: Mapping[str, float], source: object = "mesh") -> No
     InputError
         Names each figure that fails, with its limit.
     """
-    failed = [
-        f"{name} is {quality[name]:.4g} (allowed: {low:g} to {high:g})"
-        for name, (low, high) in LIMITS.items()
-        if name in quality and not low <= quality[name] <= high
-    ]
-    if failed:
-        raise InputError(source, "; ".join(failed), "try another number of nodes or seed, or smoother labels")
+    if found := faults(quality):
+        raise InputError(source, "; ".join(found), "try another number of nodes or seed, or smoother labels")

@@ -89,7 +89,8 @@ def tetrahedralize(
 
 
 def _run_worker(given: Path, made: Path, timeout_s: float, waiting: Callable[[float], None] | None) -> None:
-    # One thread: fTetWild's result is then the same each time, and other work keeps its cores.
+    # One thread, so that other work keeps its cores.
+    # fTetWild draws random numbers: equal input gives similar meshes, not equal ones.
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "brainshift_ros.mesh.tetwild_worker", str(given), str(made)]
     with open(made.with_suffix(".log"), "w+b") as log:
