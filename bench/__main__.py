@@ -39,8 +39,8 @@ def main(output: Path, with_scipy: bool) -> None:
     files.folder.mkdir(parents=True, exist_ok=True)
     settings = DemoSettings()
     with console.status("patient"):
-        t1, labels = make_images(settings, files)
-        patient, _, _ = make_patients(settings, files, t1, labels, lambda _stage, _fraction: None)
+        images = make_images(settings, files)
+        patient, _, _ = make_patients(settings, files, images, lambda _stage, _fraction: None)
     scene = read_scene(resource("config/scene_demo.yaml"))
     fastest = resolve("auto")
     solvers = (fastest, "scipy") if with_scipy and fastest != "scipy" else (fastest,)

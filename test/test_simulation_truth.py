@@ -58,6 +58,8 @@ def test_targets_are_where_their_names_say(small_patient):
     skull = np.unique(mesh.facets["skull"])
     assert np.isin(groups["surface"], skull).all()
     assert not np.isin(groups["subsurface"], skull).any()
-    assert (mesh.nodes[groups["contralateral"], 0] > -0.005).all()
+    # Elements below the falx belong to a side by their centroid, so a corner may cross the midline by less than an edge.
+    edge = small_patient.quality["edge_median_mm"] / 1000.0
+    assert (mesh.nodes[groups["contralateral"], 0] > -edge).all()
     assert (np.abs(mesh.nodes[groups["midline"], 0]) < 0.012).all()
     assert len(np.intersect1d(groups["subsurface"], groups["deep"])) == 0

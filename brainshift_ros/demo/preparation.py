@@ -10,13 +10,10 @@ from brainshift_ros.demo.settings import DemoFiles, DemoSettings
 from brainshift_ros.files import atomic_path, sha256_of_file
 from brainshift_ros.h5 import digest
 from brainshift_ros.image.io import write_volume
-from brainshift_ros.image.template import template_labels, template_landmarks, template_t1
-from brainshift_ros.image.tumor import draw_tumor
-from brainshift_ros.image.volume import Volume
 from brainshift_ros.mesh.build import build_patient
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
 from brainshift_ros.mesh.patient_file import read_patient, write_patient
-from brainshift_ros.mesh.sheets import septa_from_landmarks
+from brainshift_ros.mesh.template_patient import TemplateImages, template_patient_images
 from brainshift_ros.resources import resource
 
 Progress = Callable[[str, float], None]
@@ -25,17 +22,16 @@ Progress = Callable[[str, float], None]
 TRUTH_MESH_SEED = 1
 
 
-def make_images(settings: DemoSettings, files: DemoFiles) -> tuple[Volume, Volume]:
+def make_images(settings: DemoSettings, files: DemoFiles) -> TemplateImages:
     """Draw the tumour into the template's T1 and labels, and write both."""
-    t1 = template_t1()
-    t1, labels = draw_tumor(t1, template_labels(template_landmarks()), settings.tumor)
-    write_volume(files.t1, t1)
-    write_volume(files.labels, labels)
-    return t1, labels
+    images = template_patient_images(settings.tumor, settings.septa_spacing_mm)
+    write_volume(files.t1, images.t1)
+    write_volume(files.labels, images.labels)
+    return images
 
 
 def make_patients(
-    settings: DemoSettings, files: DemoFiles, t1: Volume, labels: Volume, progress: Progress
+    settings: DemoSettings, files: DemoFiles, images: TemplateImages, progress: Progress
 ) -> tuple[PatientModel, PatientModel, bool]:
     """Mesh the patient and the truth, or read them if nothing that decides them has changed since they were made.
 
@@ -43,11 +39,11 @@ def make_patients(
     -------
     patient, truth_patient, kept
     """
-    made_from = _made_from(settings, t1, labels)
+    made_from = _made_from(settings, images)
     if _kept(files, made_from):
         return read_patient(files.patient), read_patient(files.truth_patient), True
     files.made_from.unlink(missing_ok=True)
-    septa = septa_from_landmarks(template_landmarks().septa)
+    t1 = images.t1
     image = ImageReference(files.t1.name, sha256_of_file(files.t1), t1.shape, t1.T_patient_voxel)
     models = []
     for number, (name, path, nodes, seed) in enumerate(
@@ -60,7 +56,7 @@ def make_patients(
         def report(stage: str, fraction: float, name: str = name, number: int = number) -> None:
             progress(f"{name}: {stage}", (number + fraction) / 2.0)
 
-        model = build_patient(t1, labels, septa, nodes=nodes, image_ref=image, seed=seed, progress=report)
+        model = build_patient(t1, images.labels, images.septa, nodes=nodes, image_ref=image, seed=seed, progress=report)
         write_patient(path, model)
         models.append(model)
     with atomic_path(files.made_from) as temporary:
@@ -68,17 +64,19 @@ def make_patients(
     return models[0], models[1], False
 
 
-def _made_from(settings: DemoSettings, t1: Volume, labels: Volume) -> dict[str, str | int]:
+def _made_from(settings: DemoSettings, images: TemplateImages) -> dict[str, str | float]:
+    t1 = images.t1
     return {
         "software": __version__,
-        "images": digest(t1.data, t1.T_patient_voxel, labels.data),
+        "images": digest(t1.data, t1.T_patient_voxel, images.labels.data),
         "landmarks": sha256_of_file(resource("config/template_mni152.yaml")),
         "nodes": settings.nodes,
         "truth_nodes": settings.truth_nodes,
+        "septa_spacing_mm": settings.septa_spacing_mm,
     }
 
 
-def _kept(files: DemoFiles, made_from: dict[str, str | int]) -> bool:
+def _kept(files: DemoFiles, made_from: dict[str, str | float]) -> bool:
     if not (files.made_from.is_file() and files.patient.is_file() and files.truth_patient.is_file()):
         return False
     kept: bool = json.loads(files.made_from.read_text(encoding="utf-8")) == made_from

@@ -12,10 +12,10 @@ from brainshift_ros.atlas.file import AtlasFile
 from brainshift_ros.bags import BagWriter
 from brainshift_ros.demo.settings import DemoFiles, DemoSettings
 from brainshift_ros.geometry import invert_rigid, rigid, transform_points, unit
-from brainshift_ros.image.volume import Volume
 from brainshift_ros.mesh.cortex import cortical_surface
 from brainshift_ros.mesh.patient import PatientModel
 from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.mesh.template_patient import TemplateImages
 from brainshift_ros.simulation.craniotomy import vertex_normals
 from brainshift_ros.simulation.scanner import Scanner, SimulatedScan, SurgicalScene, make_scene, scanner_pose, take_scan
 from brainshift_ros.simulation.truth import Truth, direction_between, simulate_truth, smooth_random_field
@@ -60,7 +60,7 @@ class RecordedCase:
 
 
 def simulate_case(
-    settings: DemoSettings, atlas: AtlasFile, truth_patient: PatientModel, t1: Volume, labels: Volume
+    settings: DemoSettings, atlas: AtlasFile, truth_patient: PatientModel, images: TemplateImages
 ) -> RecordedCase:
     """Solve the truth and scan its cortex twice.
 
@@ -76,7 +76,7 @@ def simulate_case(
     level = max(entry.fluid_level for entry in atlas.entries) + settings.fluid_level_offset
     truth = simulate_truth(truth_patient, direction, level, seed=settings.case_seed)
 
-    cortex = _true_cortex(t1, labels, settings.case_seed)
+    cortex = _true_cortex(images, settings.case_seed)
     scene = make_scene(cortex, mm_to_m(craniotomy.center_mm), float(mm_to_m(craniotomy.diameter_mm)), settings.case_seed)
     rng = np.random.default_rng(settings.case_seed)
     T_patient_tracker = rigid(Rotation.random(rng=rng), rng.uniform(-0.4, 0.4, 3))
@@ -109,8 +109,8 @@ def write_case(case: RecordedCase, files: DemoFiles) -> None:
         bag.add_scan(case.later.scan)
 
 
-def _true_cortex(t1: Volume, labels: Volume, seed: int) -> Surface:
-    extracted = cortical_surface(t1, labels, closing_mm=TRUTH_CLOSING_MM, smoothing_mm=TRUTH_SMOOTHING_MM)
+def _true_cortex(images: TemplateImages, seed: int) -> Surface:
+    extracted = cortical_surface(images.t1, images.labels, closing_mm=TRUTH_CLOSING_MM, smoothing_mm=TRUTH_SMOOTHING_MM)
     length = float(mm_to_m(SEGMENTATION_ERROR_LENGTH_MM))
     error = smooth_random_field(extracted.vertices, length, np.random.default_rng(seed), modes=256)
     normals = vertex_normals(extracted.vertices, extracted.faces)

@@ -83,15 +83,15 @@ def run_demo(scene: Scene, settings: DemoSettings, folder: Path, progress: Progr
     stages = _Stages(progress)
     begin = perf_counter()
     with stages.stage("image"):
-        t1, labels = make_images(settings, files)
+        images = make_images(settings, files)
     with stages.stage("mesh") as report:
-        patient, truth_patient, kept = make_patients(settings, files, t1, labels, report)
+        patient, truth_patient, kept = make_patients(settings, files, images, report)
     with stages.stage("atlas") as report:
         build = build_atlas(patient, scene, files.atlas, progress=report)
     with open_atlas(files.atlas) as atlas:
         mesh, patient_id, entries = atlas.mesh, atlas.patient_id, len(atlas.entries)
         with stages.stage("case"):
-            case = simulate_case(settings, atlas, truth_patient, t1, labels)
+            case = simulate_case(settings, atlas, truth_patient, images)
             write_case(case, files)
     with stages.stage("graph"):
         session = run_session(files)
@@ -100,7 +100,7 @@ def run_demo(scene: Scene, settings: DemoSettings, folder: Path, progress: Progr
         write_field(files.field, field)
         groups = evaluate_field(case, field)
     with stages.stage("pictures") as report:
-        image_checks = draw_all(files, patient, t1, case, session, field, report)
+        image_checks = draw_all(files, patient, images.t1, case, session, field, report)
     stages.times_s["total"] = round(perf_counter() - begin, 3)
     stages.times_s["scan_to_field"] = round(session.scan_to_field_s, 3)
 

@@ -16,6 +16,8 @@ class DemoSettings:
     ----------
     nodes, truth_nodes
         Wanted mesh sizes of the patient model and of the truth, which shall differ.
+    septa_spacing_mm
+        Resolution of the septa's sheets; near the mesh's edge length.
     tumor
         The drawn tumour.
     scan_width, scan_height
@@ -30,6 +32,7 @@ class DemoSettings:
 
     nodes: int = 20_000
     truth_nodes: int = 12_000
+    septa_spacing_mm: float = 5.0
     tumor: TumorShape = field(default_factory=TumorShape)
     scan_width: int = 640
     scan_height: int = 480
