@@ -20,11 +20,11 @@ from brainshift_ros.resources import resource
 
 
 def show(console: Console, title: str, rows: list[dict[str, Any]]) -> None:
-    """Print rows as a table."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    table = Table(*names, title=title)
-    for row in rows:
-        table.add_row(*(f"{row[n]:.3g}" if isinstance(row.get(n), float) else str(row.get(n, "")) for n in names))
+    """Print a column a row, under the row's first value: a few candidates, many figures of each."""
+    heading, *names = rows[0]
+    table = Table(heading, *(str(row[heading]) for row in rows), title=title)
+    for name in names:
+        table.add_row(name, *(f"{row[name]:.3g}" if isinstance(row[name], float) else str(row[name]) for row in rows))
     console.print(table)
 
 
@@ -50,7 +50,8 @@ def main(output: Path, with_scipy: bool) -> None:
     show(console, f"atlas of {len(patient.mesh.nodes)} nodes", results["atlas"])
     with console.status("inverse"):
         results["inverse"] = inverse.run(output / f"atlas_{fastest}.h5", patient)
-    show(console, f"inverse from {inverse.POINTS} points, noise {1e3 * inverse.NOISE_M} mm", results["inverse"])
+    title = f"inverse from {inverse.POINTS} points, noise {1e3 * inverse.NOISE_M} mm; truth on the atlas's own mesh"
+    show(console, title, results["inverse"])
     with atomic_path(output / "bench.json") as temporary:
         temporary.write_text(json.dumps(results, indent=1), encoding="utf-8")
     console.print(f"written: {output / 'bench.json'}")

@@ -11,15 +11,35 @@ from pathlib import Path
 from brainshift_ros.errors import InputError
 
 
+def writable_target(path: str | Path, suffixes: tuple[str, ...] = ()) -> Path:
+    """`path` if a file can be written there, else an :class:`InputError`; long work asks before it starts.
+
+    Parameters
+    ----------
+    path
+        Need not exist; a file that does is replaced.
+    suffixes
+        Endings of which the name must have one, where the writer chooses its format by them.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise InputError(path, "its folder does not exist", "create the folder or choose another output path")
+    if path.is_dir():
+        raise InputError(path, "is a folder", "give the path of a file to write")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError(path, "its folder cannot be written to", "change its permissions or choose another output path")
+    if suffixes and not path.name.endswith(suffixes):
+        raise InputError(path, f"its name does not end in {' or '.join(suffixes)}", "choose such a name")
+    return path
+
+
 @contextmanager
 def atomic_path(target: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `target`; rename it over `target` on success, remove it on any failure.
 
     The temporary name keeps the suffixes (``.nii.gz``), since writers choose the format by them.
     """
-    target = Path(target)
-    if not target.parent.is_dir():
-        raise InputError(target, "its folder does not exist", "create the folder or choose another output path")
+    target = writable_target(target)
     temporary = target.with_name(f".part-{os.getpid()}-{target.name}")
     try:
         yield temporary

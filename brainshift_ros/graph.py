@@ -51,7 +51,11 @@ LRS_INITIAL_POSE = Topic("lrs/initial_pose", "geometry_msgs/msg/PoseStamped", Qo
 REGISTRATION = Topic("registration/patient_from_tracker", "geometry_msgs/msg/TransformStamped", Qos.LATCHED, PATIENT_FRAME, "m")
 LRS_REGISTERED = Topic("lrs/registered", "sensor_msgs/msg/PointCloud2", Qos.RELIABLE, PATIENT_FRAME, "x y z in m, rgb")
 HOMOLOGOUS_POINTS = Topic(
-    "homologous_points", "sensor_msgs/msg/PointCloud2", Qos.LATCHED, PATIENT_FRAME, "x y z dx dy dz sigma, all m"
+    "homologous_points",
+    "sensor_msgs/msg/PointCloud2",
+    Qos.LATCHED,
+    PATIENT_FRAME,
+    "x y z dx dy dz sigma, all m; empty: not measured",
 )
 RETRACTOR_BLADE = Topic("retractor/blade", "geometry_msgs/msg/PolygonStamped", Qos.RELIABLE, PATIENT_FRAME, "m")
 RETRACTOR_DISPLACEMENT = Topic("retractor/displacement", "geometry_msgs/msg/Vector3Stamped", Qos.RELIABLE, PATIENT_FRAME, "m")

@@ -13,10 +13,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 
 from brainshift_ros import graph
+from brainshift_ros.errors import InputError
 from brainshift_ros.resources import resource
 
 #: Where a line of a process's output goes: (name of the process, line).
@@ -49,6 +51,22 @@ def ros_environment(domain_id: int | None = None) -> dict[str, str]:
         environment["ROS_DOMAIN_ID"] = str(domain_id)
         environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     return environment
+
+
+def require_ros() -> None:
+    """Refuse to start ROS processes where this Python has no ROS: one error here instead of one traceback a process.
+
+    Raises
+    ------
+    InputError
+        rclpy or a message package of the graph is not installed; names each.
+    """
+    types = [*(topic.type for topic in graph.TOPICS), *(service.type for service in graph.SERVICES)]
+    needed = sorted({"rclpy", *(name.split("/")[0] for name in types)})
+    missing = [name for name in needed if find_spec(name) is None]
+    if missing:
+        remedy = "run `pip install -r requirements/ros_wheels.txt` in this environment, or source a ROS 2 installation first"
+        raise InputError("ROS 2", f"{', '.join(missing)} not found by {sys.executable}", remedy)
 
 
 class Process:
@@ -121,6 +139,11 @@ class Graph:
     sink
         Takes the nodes' output.
 
+    Raises
+    ------
+    InputError
+        No ROS 2 is installed.
+
     Examples
     --------
     >>> with Graph(case_parameters("atlas.h5", "patient.h5")) as running:  # doctest: +SKIP
@@ -135,6 +158,7 @@ class Graph:
         domain_id: int | None = None,
         sink: Sink = print_line,
     ) -> None:
+        require_ros()
         self.environment = ros_environment(domain_id)
         self.processes: dict[str, Process] = {}
         self._parameters = parameters

@@ -22,6 +22,11 @@ def m_to_mm(value_m: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(value_m, dtype=np.float64) * MM_PER_M
 
 
+def m3_to_ml(volume_m3: ArrayLike) -> NDArray[np.float64]:
+    """Cubic metres to millilitres, elementwise."""
+    return np.asarray(volume_m3, dtype=np.float64) * 1e6
+
+
 def affine_mm_to_m(affine_mm: ArrayLike) -> NDArray[np.float64]:
     """Convert a 4x4 voxel-to-world affine in millimetres to metres: all of its first three rows scale."""
     affine = np.array(affine_mm, dtype=np.float64)

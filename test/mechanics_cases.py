@@ -6,7 +6,7 @@ import numpy as np
 from skfem import MeshTet
 
 from brainshift_ros.image.volume import Region
-from brainshift_ros.mechanics.submesh import TET_FACES
+from brainshift_ros.mesh.facets import LOCAL_FACES
 from brainshift_ros.mesh.patient import ImageReference, PatientModel, Tissue
 from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.tetmesh import TetMesh
@@ -32,7 +32,7 @@ def positive(nodes, elements):
 
 def outer_facets(elements):
     """Faces that belong to one element only, outward."""
-    faces = elements[:, TET_FACES].reshape(-1, 3)
+    faces = elements[:, LOCAL_FACES].reshape(-1, 3)
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return faces[first[count == 1]].astype(np.int32)
 
@@ -81,7 +81,7 @@ def split_box(counts=(4, 4, 4), size=(0.08, 0.08, 0.08), depth=1.0):
     elements[right] = copy[elements[right]]
     outer[right_outer] = copy[outer[right_outer]]
     nodes = np.concatenate([nodes, nodes[doubled]])
-    faces = elements[:, TET_FACES].reshape(-1, 3)
+    faces = elements[:, LOCAL_FACES].reshape(-1, 3)
     on_sheet = np.isclose(nodes[faces][..., 0], size[0] / 2).all(axis=1)
     on_sheet &= (nodes[faces][..., 2] >= edge - 1e-12).all(axis=1)
     facets = {"skull": outer, "falx": faces[on_sheet].astype(np.int32)}

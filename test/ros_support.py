@@ -91,8 +91,12 @@ class Probe:
         """Publish a plain message."""
         self.publisher(topic).publish(to_message(topic.type, plain))
 
-    def call(self, node, service, limit_s=LIMIT_S):
-        """Call a Trigger service of a node; return the response and the seconds it took."""
+    def call(self, node, service, limit_s=LIMIT_S, again_s=LIMIT_S):
+        """Call a Trigger service of a node; return the response and the seconds it took.
+
+        A node that may have been killed must be asked again when no answer comes within `again_s`: to DDS a killed server is
+        there until its lease ends, and the request that is sent to it reaches nobody.
+        """
         key = (node, service)
         if key not in self._clients:
             declared = next(item for item in graph.SERVICES if (item.node, item.name) == key)
@@ -100,9 +104,25 @@ class Probe:
         client = self._clients[key]
         self.until(client.service_is_ready, f"service {node}/{service}")
         begin = time.monotonic()
-        future = client.call_async(client.srv_type.Request())
-        self.until(future.done, f"an answer of {node}/{service}", limit_s)
-        return future.result(), time.monotonic() - begin
+        requests = []
+
+        def answered():
+            if time.monotonic() - begin >= again_s * len(requests):
+                requests.append(client.call_async(client.srv_type.Request()))
+            return [request for request in requests if request.done()]
+
+        answer = self.until(answered, f"an answer of {node}/{service}", limit_s)[0]
+        return answer.result(), time.monotonic() - begin
+
+    def has_settled(self, *nodes):
+        """Wait until everything latched by these nodes has had time to arrive: three heartbeats of each."""
+        begun = len(self.received[graph.DIAGNOSTICS])
+
+        def heard():
+            said = [s.name for message in self.received[graph.DIAGNOSTICS][begun:] for s in message.status]
+            return all(said.count(node) >= 3 for node in nodes)
+
+        self.until(heard, f"three heartbeats of {', '.join(nodes)}")
 
     def said(self):
         """Newest (level, message) of each node."""

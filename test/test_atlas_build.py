@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -100,6 +102,23 @@ def test_faults_are_found_before_the_work(tmp_path):
     with pytest.raises(InputError, match="its folder does not exist"):
         build_atlas(PATIENT, SCENE, tmp_path / "absent" / "a.h5", progress=stages.append)
     assert stages == []
+
+
+def test_what_the_scene_asks_for_and_the_patient_lacks_is_said(tmp_path):
+    mesh = PATIENT.mesh
+    bare = replace(mesh, facets={name: facets for name, facets in mesh.facets.items() if name not in ("falx", "tentorium")})
+    scene = SCENE.model_copy(
+        update={
+            "craniotomy": Craniotomy(center_mm=(500.0, 0.0, 0.0), diameter_mm=60.0),
+            "gravity": Gravity(direction=(0.0, -0.6, -0.8), orientations=1, fluid_levels=1),
+            "resection": "none",
+        }
+    )
+    report = build_atlas(replace(PATIENT, mesh=bare), scene, tmp_path / "a.h5", solver="scipy")
+    assert report.craniotomy_shift is None
+    assert any("asks for septa" in warning for warning in report.warnings)
+    assert any("no cortex lies under the craniotomy" in warning for warning in report.warnings)
+    assert build_atlas(PATIENT, SCENE, tmp_path / "b.h5").warnings == ()
 
 
 def run(*arguments):

@@ -71,6 +71,7 @@ def test_what_is_not_modelled_is_refused_by_name(tmp_path, text, key):
         ("", "no keys"),
         ("resection: both\n", "no mechanism"),
         (GRAVITY + "resection: maybe\n", "resection"),
+        (GRAVITY + "version: 2\n", "version"),
         (GRAVITY + "fluid: 3\n", "fluid"),
         (GRAVITY.replace("-1.0", "-2.0"), "unit vector"),
         (GRAVITY.replace("-1.0", ".nan"), "gravity.direction"),

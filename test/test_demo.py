@@ -72,7 +72,7 @@ def test_updated_mr_is_what_itk_makes_of_the_transform(demo):
 def test_results_and_pictures_are_there_and_nothing_half_written(demo):
     _, folder, _ = demo
     names = {path.name for path in folder.iterdir()}
-    pictures = {"patient.png", "scan_vessels.png", "mr_before_after.png", "displacement_mm.png", "vectors.png"}
+    pictures = {"patient.png", "scan_vessels.png", "mr_before_after.png", "displacement_mm.png", "vectors.png", "boundary.png"}
     files = {"patient.h5", "atlas.h5", "case.mcap", "session.mcap", "field.h5", "displacement_forward.nii.gz", "summary.json"}
     assert pictures | files <= names
     assert not [name for name in names if name.startswith(".part")]

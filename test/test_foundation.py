@@ -90,6 +90,11 @@ def test_writing_into_a_missing_folder_says_so(tmp_path):
         pass
 
 
+def test_writing_onto_a_folder_says_so(tmp_path):
+    with pytest.raises(InputError, match="is a folder"), atomic_path(tmp_path):
+        pass
+
+
 def test_missing_files_and_folders_are_told_apart(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         existing_file(tmp_path / "absent.h5", "patient file")

@@ -92,7 +92,11 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
     singular.header["qform_code"] = 0
     singular._affine = singular.header.get_sform()
     nib.save(singular, folder / "singular.nii.gz")
+    header = bytearray(saved(folder / "plain.nii", ones, affine).read_bytes())
+    header[70:72] = (9999).to_bytes(2, "little")  # a data type that does not exist
+    (folder / "header.nii").write_bytes(header)
     return {
+        "header": (folder / "header.nii", "is not a NIfTI image"),
         "missing": (folder / "nowhere.nii.gz", "no such file"),
         "folder": (folder, "is a folder"),
         "foreign": (text, "is not a NIfTI image"),
@@ -107,7 +111,7 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
 
 
 @pytest.mark.parametrize(
-    "fault", ["missing", "folder", "foreign", "cut", "4-D", "placeless", "singular", "zero", "nan", "unit"]
+    "fault", ["header", "missing", "folder", "foreign", "cut", "4-D", "placeless", "singular", "zero", "nan", "unit"]
 )
 def test_fault_is_one_clear_error(tmp_path: Path, fault: str) -> None:
     path, text = bad_files(tmp_path)[fault]
@@ -116,6 +120,23 @@ def test_fault_is_one_clear_error(tmp_path: Path, fault: str) -> None:
     assert text in str(error.value)
     assert str(path) in str(error.value)
     assert error.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("dtype", "stored"), [(np.int64, np.int32), (np.uint64, np.int32), (np.float16, np.float32), (np.bool_, np.uint8)]
+)
+def test_types_that_few_readers_know_are_stored_as_others(tmp_path: Path, dtype: type, stored: type) -> None:
+    data = (np.arange(60).reshape(3, 4, 5) % 6).astype(dtype)
+    write_volume(tmp_path / "labels.nii.gz", Volume(data, np.diag([0.001, 0.001, 0.001, 1.0])))
+    back = sitk.GetArrayFromImage(sitk.ReadImage(str(tmp_path / "labels.nii.gz"))).T
+    assert back.dtype == stored
+    np.testing.assert_array_equal(back, data.astype(stored))
+
+
+def test_a_name_that_no_nifti_file_bears_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"does not end in \.nii or \.nii\.gz"):
+        write_volume(tmp_path / "warped.nrrd", Volume(np.ones((3, 3, 3)), np.diag([0.001, 0.001, 0.001, 1.0])))
+    assert not list(tmp_path.iterdir())
 
 
 def test_linear_resampling_is_exact_for_a_linear_image() -> None:

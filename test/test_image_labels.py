@@ -33,6 +33,11 @@ def test_strange_label_values_are_named(value: float) -> None:
         labels_on_grid(Volume(labels, T), ball())
 
 
+def test_labels_stored_as_scaled_floats_are_taken_as_whole_numbers() -> None:
+    scaled = ball().data * np.float32(0.9999)
+    np.testing.assert_array_equal(labels_on_grid(Volume(scaled, T), ball()).data, ball().data)
+
+
 def test_labels_elsewhere_are_refused() -> None:
     shifted = T.copy()
     shifted[:3, 3] = 0.5
@@ -122,5 +127,5 @@ def test_landmark_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is not YAML"):
         read_septa_landmarks(bad)
     bad.write_text("")
-    with pytest.raises(InputError, match="no landmarks"):
+    with pytest.raises(InputError, match="holds no keys"):
         read_septa_landmarks(bad)

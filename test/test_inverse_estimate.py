@@ -195,14 +195,22 @@ def test_zero_shift_is_said():
     assert result.correction_percent is None
     assert result.angular_error_deg is None
     assert not result.field.displacement.any()
-    assert any("below its own noise" in warning for warning in result.warnings)
+    assert any("not above its own noise" in warning for warning in result.warnings)
 
 
 def test_a_shift_against_the_atlas_is_not_valid():
     result = estimate(measure(-mixture()))
     assert not result.valid
     assert result.weights == ()
-    assert any("every weight is zero" in warning for warning in result.warnings)
+    assert any("every weight is zero" in reason for reason in result.reasons)
+
+
+def test_a_shift_against_the_atlas_is_not_valid_even_within_a_wide_sigma():
+    measured = measure(-mixture())
+    shift = np.linalg.norm(measured.displacements, axis=1).mean()
+    result = estimate(replace(measured, sigma=np.full(20, shift / 2.5)))
+    assert len(result.reasons) == 1
+    assert "every weight is zero" in result.reasons[0]
 
 
 def test_a_shift_beyond_the_atlas_saturates_and_is_said():

@@ -205,6 +205,12 @@ def test_file_round_trip(small_patient: PatientModel, tmp_path: Path) -> None:
         np.testing.assert_array_equal(again.mesh.facets[name], facets)
 
 
+def test_a_model_without_quality_figures_and_warnings_round_trips(small_patient: PatientModel, tmp_path: Path) -> None:
+    write_patient(tmp_path / "p.h5", dataclasses.replace(small_patient, quality={}, warnings=()))
+    again = read_patient(tmp_path / "p.h5")
+    assert (dict(again.quality), again.warnings, again.patient_id) == ({}, (), small_patient.patient_id)
+
+
 @pytest.mark.parametrize("dataset", ["mesh/nodes", "tissue", "cortex/vertices", "image/T_patient_voxel"])
 def test_tampering_is_noticed(small_patient: PatientModel, tmp_path: Path, dataset: str) -> None:
     path = tmp_path / "p.h5"

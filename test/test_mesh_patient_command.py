@@ -23,11 +23,13 @@ def run(*arguments: object) -> None:
 
 
 def test_labels_and_tumour_mask_make_a_patient_without_septa(
-    tmp_path: Path, template_case: tuple[Volume, Volume], small_patient: PatientModel
+    tmp_path: Path, template_case: tuple[Volume, Volume], small_patient: PatientModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     t1, labels = template_case
     tumor = labels.data == Region.TUMOR
     healthy = np.where(tumor, Region.LEFT_CEREBRUM, labels.data).astype(np.uint8)
+    i, j, k = np.argwhere(labels.data == Region.RIGHT_CEREBRUM).mean(axis=0).astype(int)
+    healthy[i - 3 : i + 3, j - 3 : j + 3, k - 3 : k + 3] = Region.TUMOR  # a second, smaller one
     window = tuple(slice(axis.min() - 3, axis.max() + 4) for axis in np.nonzero(tumor))
     T_mask = t1.T_patient_voxel.copy()
     T_mask[:3, 3] += T_mask[:3, :3] @ [axis.start for axis in window]
@@ -37,7 +39,11 @@ def test_labels_and_tumour_mask_make_a_patient_without_septa(
     output = tmp_path / "patient.h5"
     options = ("--labels", tmp_path / "labels.nii.gz", "--tumor", tmp_path / "tumor.nii.gz", "--nodes", 2000, "--seed", 1)
 
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
     run(tmp_path / "t1.nii.gz", *options, "-o", output)
+    assert not list(elsewhere.iterdir())
 
     patient = read_patient(output)
     mesh = patient.mesh
@@ -45,6 +51,7 @@ def test_labels_and_tumour_mask_make_a_patient_without_septa(
     assert 0.8 * 2000 < len(mesh.nodes) < 1.2 * 2000
     assert set(mesh.facets) == {"skull", "tumor"}
     assert any("septa" in warning for warning in patient.warnings)
+    assert any("1.7 ml of tumour apart from its largest piece" in warning for warning in patient.warnings)
     assert len(cKDTree(mesh.nodes).query_pairs(1e-9)) == 0
     # the same tumour as that drawn into the labels, in another mesh of the same brain
     other = small_patient.mesh
@@ -72,4 +79,8 @@ def test_what_cannot_be_done_is_said(tmp_path: Path, template_case: tuple[Volume
         run(*given, "--septa", tmp_path / "septa.yaml", *target)
     with pytest.raises(InputError, match="holds values other than"):
         run(tmp_path / "t1.nii.gz", "--labels", tmp_path / "t1.nii.gz", *target)
+    headless = np.where(labels.data == Region.BRAINSTEM, Region.CEREBELLUM, labels.data).astype(np.uint8)
+    write_volume(tmp_path / "no_stem.nii.gz", Volume(headless, labels.T_patient_voxel))
+    with pytest.raises(InputError, match="hold no brainstem"):
+        run(tmp_path / "t1.nii.gz", "--labels", tmp_path / "no_stem.nii.gz", *target)
     assert not (tmp_path / "p.h5").exists()

@@ -10,9 +10,9 @@ from brainshift_ros.geometry import transform_points
 from brainshift_ros.image.template import template_landmarks
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.mesh.cortex import CLOSING_MM, DEPTH_MM, cortical_surface
+from brainshift_ros.mesh.queries import inside
 from brainshift_ros.mesh.sheets import septa_from_landmarks, sheet
 from brainshift_ros.mesh.side import merged, side_of_sheet
-from brainshift_ros.mesh.sizing import inside_surface
 from brainshift_ros.mesh.surfacing import (
     decimate,
     enclosed_volume,
@@ -34,9 +34,16 @@ def ball_mask() -> np.ndarray:
 
 @pytest.mark.parametrize("mirror", [1.0, -1.0])
 def test_surface_of_a_ball_points_outward_on_any_grid(mirror: float) -> None:
-    surface = surface_of_mask(ball_mask(), T @ np.diag([mirror, 1.0, 1.0, 1.0]), blur_voxels=1.0)
+    surface = surface_of_mask(ball_mask(), T @ np.diag([mirror, 1.0, 1.0, 1.0]), blur=0.001)
     assert enclosed_volume(surface) == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.02)
     assert face_areas(surface).sum() == pytest.approx(4 * np.pi * RADIUS**2, rel=0.03)
+
+
+def test_blur_is_as_wide_across_thick_slices_as_in_them() -> None:
+    thick = T @ np.diag([1.0, 1.0, 3.0, 1.0])
+    surface = surface_of_mask(ball_mask()[:, :, ::3], thick, blur=0.004)
+    # A ball stays round: a blur counted in voxels would flatten it by a millimetre and more along the slices' normal.
+    assert np.ptp(surface.vertices, axis=0) == pytest.approx(np.full(3, np.ptp(surface.vertices[:, 0])), abs=0.0006)
 
 
 def test_taubin_keeps_the_volume_that_laplace_loses() -> None:
@@ -49,7 +56,7 @@ def test_taubin_keeps_the_volume_that_laplace_loses() -> None:
 
 
 def test_decimation_keeps_the_shape() -> None:
-    surface = smooth_taubin(surface_of_mask(ball_mask(), T, 1.0))
+    surface = smooth_taubin(surface_of_mask(ball_mask(), T, 0.001))
     few = decimate(surface, 1000)
     assert len(few.faces) <= 1000
     assert enclosed_volume(few) == pytest.approx(enclosed_volume(surface), rel=0.01)
@@ -62,11 +69,11 @@ def test_empty_mask_is_refused() -> None:
 
 
 def test_inside_agrees_with_the_analytic_ball() -> None:
-    surface = smooth_taubin(surface_of_mask(ball_mask(), T, 1.0))
+    surface = smooth_taubin(surface_of_mask(ball_mask(), T, 0.001))
     points = np.random.default_rng(0).uniform(-0.03, 0.03, (5000, 3))
     radius = np.linalg.norm(points, axis=1)
     clear = np.abs(radius - RADIUS) > 0.001
-    np.testing.assert_array_equal(inside_surface(surface, points)[clear], radius[clear] < RADIUS)
+    np.testing.assert_array_equal(inside(surface, points)[clear], radius[clear] < RADIUS)
 
 
 def test_sheet_goes_through_its_landmarks_and_faces_its_normal() -> None:

@@ -15,7 +15,7 @@ from brainshift_ros.nodes.messages import message_class
 from brainshift_ros.runner import Graph
 from brainshift_ros.wire.retraction import encode_columns
 from brainshift_ros.wire.texts import AtlasInfo, encode_text
-from brainshift_ros.wire.vectors import decode_field, encode_homologous
+from brainshift_ros.wire.vectors import decode_field, encode_homologous, encode_withdrawal
 
 pytestmark = pytest.mark.integration
 
@@ -126,7 +126,7 @@ def broken_points(**changes):
 WRONG = {
     "frame is 'tracker', expected 'patient'": {"header": {"frame_id": "tracker"}},
     "1 of 343 numbers of its points are not finite": {"table": (3, 0, np.nan)},
-    "holds no points": {"width": 0, "row_step": 0, "data": np.zeros(0, dtype=np.uint8)},
+    "holds no points": {"width": 0, "row_step": 0},
     "row_step x height": {"data": np.zeros(10, dtype=np.uint8)},
     "sigmas are not positive": {"table": (3, 6, 0.0)},
     "send metres, not millimetres": {"table": (3, 0, 80.0)},
@@ -164,6 +164,9 @@ def test_points_that_the_atlas_cannot_explain_are_not_valid(case):
     estimate = json.loads(case.newest(graph.SHIFT_ESTIMATE).data)
     assert estimate["valid"] is False
     assert estimate["reasons"][0] in message
+    with Probe(11) as late:
+        assert json.loads(late.newest(graph.SHIFT_ESTIMATE).data)["valid"] is False
+        assert decode_field(late.newest(graph.DISPLACEMENT_FIELD)).stamp_ns == 2501, "the refused field is not shown"
     send_points(case, 2601)
     field_of(case, 2601)
 
@@ -193,12 +196,52 @@ def test_warping_without_an_image_says_what_to_do(case):
 
 
 def test_a_killed_node_recovers_from_what_is_latched(case):
-    """Points stay latched by their publisher, the atlas by atlas_loader: the new inverse finds both."""
+    """Points stay latched by their publisher, the atlas by atlas_loader: the new inverse finds both, and answers."""
     case.running.processes["inverse"].popen.kill()
     case.running.processes["inverse"].wait()
     case.received[graph.DISPLACEMENT_FIELD].clear()
     case.running.start("inverse")
     np.testing.assert_allclose(field_of(case, 2800).displacements, box_truth(), atol=2e-5)
+    response, _ = case.call("inverse", "warp_image", again_s=2.0)
+    assert "brainshift run --image" in response.message
+
+
+RESULTS = (graph.DISPLACEMENT_FIELD, graph.SHIFT_ESTIMATE)
+
+
+def assert_late_joiners_get_no_result(case):
+    with Probe(11) as late:
+        late.listen(*RESULTS)
+        markers = late.newest(graph.DISPLACEMENT_MARKERS).markers
+        late.has_settled("inverse", "atlas_loader")
+        assert [late.received[topic] for topic in RESULTS] == [[], []]
+    assert [marker.action for marker in markers] == [3], "DELETEALL: displays are cleared"
+    response, _ = case.call("inverse", "warp_image")
+    assert response.message == "there is no valid displacement field to warp by"
+
+
+def test_an_empty_cloud_takes_points_and_results_back(case):
+    case.send(graph.HOMOLOGOUS_POINTS, encode_withdrawal(2850))
+    case.says("inverse", OK, "waiting for homologous points")
+    assert_late_joiners_get_no_result(case)
+    send_points(case, 2851)
+    np.testing.assert_allclose(field_of(case, 2851).displacements, box_truth(), atol=2e-5)
+
+
+def test_points_of_one_patient_are_not_used_with_the_atlas_of_another(case):
+    info, count = info_of(case), len(case.received[graph.DISPLACEMENT_FIELD])
+    write_box_atlas(case.atlas_file, patient_id="c1" * 32)
+    case.until(lambda: info_of(case).patient_id == "c1" * 32, "the other patient's atlas")
+    case.says("inverse", OK, "waiting for homologous points")
+    assert_late_joiners_get_no_result(case)
+    assert len(case.received[graph.DISPLACEMENT_FIELD]) == count
+    send_points(case, 2860)
+    field_of(case, 2860)
+    case.until(lambda: json.loads(case.newest(graph.SHIFT_ESTIMATE).data)["ids"]["patient"] == "c1" * 32, "the new estimate")
+    write_box_atlas(case.atlas_file, patient_id=info.patient_id)
+    case.until(lambda: info_of(case).atlas_id == info.atlas_id, "the first patient's atlas")
+    send_points(case, 2861)
+    field_of(case, 2861)
 
 
 def test_a_new_atlas_file_is_announced_and_used(case):
@@ -242,6 +285,22 @@ def test_an_announcement_that_does_not_fit_its_file_is_refused(case):
     wrong = info.model_copy(update={"atlas_id": "ff" * 32})
     case.send(graph.ATLAS_INFO, encode_text(wrong))
     case.says("inverse", ERROR, "but ffffffffffff was announced")
+    case.send(graph.ATLAS_INFO, encode_text(info))
+    case.says("inverse", OK, "")
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"path": "/nowhere/atlas.h5"}, "/nowhere/atlas.h5: no such file"),
+        ({"schema_name": "brainshift/atlas-info/2"}, "atlas/info: schema: "),
+        ({"patient_id": ""}, "atlas/info: patient_id: "),
+    ],
+)
+def test_a_wrong_announcement_is_named_and_the_next_good_one_is_used(case, changes, fault):
+    info = info_of(case)
+    case.send(graph.ATLAS_INFO, encode_text(info.model_copy(update=changes)))
+    case.says("inverse", ERROR, fault)
     case.send(graph.ATLAS_INFO, encode_text(info))
     case.says("inverse", OK, "")
 

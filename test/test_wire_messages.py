@@ -30,7 +30,14 @@ from brainshift_ros.wire.retraction import (
     encode_retraction_vector,
 )
 from brainshift_ros.wire.texts import AtlasInfo, ShiftEstimateText, decode_text, encode_text
-from brainshift_ros.wire.vectors import decode_field, decode_homologous, encode_field, encode_homologous
+from brainshift_ros.wire.vectors import (
+    decode_field,
+    decode_homologous,
+    decode_measurement,
+    encode_field,
+    encode_homologous,
+    encode_withdrawal,
+)
 
 COORDINATE = st.floats(-0.3, 0.3)
 
@@ -132,6 +139,18 @@ def tetrahedron():
     nodes = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
     facets = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
     return TetMesh(nodes, np.array([[0, 1, 2, 3]], dtype=np.int32), np.array([1], dtype=np.uint8), {"skull": facets})
+
+
+def test_a_well_formed_empty_cloud_takes_a_measurement_back_and_any_other_empty_cloud_is_wrong():
+    nothing = encode_withdrawal(7)
+    assert decode_measurement(travelled(graph.HOMOLOGOUS_POINTS, nothing)) is None
+    for change in ({"fields": nothing["fields"][:3]}, {"fields": []}, {"data": np.zeros(28, dtype=np.uint8)}):
+        with pytest.raises(InputError, match="holds no points"):
+            decode_measurement(travelled(graph.HOMOLOGOUS_POINTS, nothing | change))
+    with pytest.raises(InputError, match="frame is 'tracker'"):
+        decode_measurement(travelled(graph.HOMOLOGOUS_POINTS, nothing | {"header": {"frame_id": "tracker"}}))
+    with pytest.raises(InputError, match="holds no points"):
+        decode_homologous(travelled(graph.HOMOLOGOUS_POINTS, nothing))
 
 
 def test_a_field_travels_and_one_that_is_not_finite_is_never_encoded():

@@ -15,10 +15,11 @@ from brainshift_ros.atlas.columns import entries_of, groups_of
 from brainshift_ros.atlas.entry import AtlasEntry
 from brainshift_ros.atlas.file import AtlasContent, write_atlas
 from brainshift_ros.atlas.scene import Craniotomy, Scene
-from brainshift_ros.errors import InputError
+from brainshift_ros.files import writable_target
 from brainshift_ros.mechanics.many import ManySolver
 from brainshift_ros.mechanics.materials import material_of
 from brainshift_ros.mechanics.solvers import SolverName
+from brainshift_ros.mechanics.submesh import SHEETS
 from brainshift_ros.mechanics.system import System, assemble_system
 from brainshift_ros.mesh.patient import PatientModel
 from brainshift_ros.mesh.tetmesh import TetMesh
@@ -97,8 +98,7 @@ def build_atlas(
     """
     report = progress if progress is not None else _silent
     entries = entries_of(scene)
-    if not Path(output).parent.is_dir():
-        raise InputError(output, "its folder does not exist", "create the folder or choose another output path")
+    writable_target(output)
     E = np.empty((len(patient.mesh.nodes), 3, len(entries)), dtype=np.float32)
     times_s: dict[str, float] = {}
     resection_states = sorted({entry.resected for entry in entries})
@@ -113,7 +113,7 @@ def build_atlas(
     content = AtlasContent(patient.patient_id, patient.mesh, patient.tissue, scene, entries, groups_of(entries))
     with _timed(times_s, "write"):
         atlas_id = write_atlas(output, content, E)
-    shift = np.sqrt((E.astype(np.float64) ** 2).sum(axis=1))
+    shift = np.sqrt(np.einsum("ncm,ncm->nm", E, E))  # no copy of E, which may fill much of the memory
     opening = None if scene.craniotomy is None else _under_craniotomy(patient.mesh, scene.craniotomy)
     return BuildReport(
         path=Path(output),
@@ -125,7 +125,7 @@ def build_atlas(
         largest_shift=shift.max(axis=0),
         craniotomy_shift=None if opening is None or not opening.any() else shift[opening].max(axis=0),
         times_s=times_s,
-        warnings=tuple(warning for state in states for warning in state.warnings),
+        warnings=_remarks(patient.mesh, scene, opening) + tuple(warning for state in states for warning in state.warnings),
     )
 
 
@@ -188,6 +188,16 @@ def _under_craniotomy(mesh: TetMesh, craniotomy: Craniotomy) -> NDArray[np.bool_
     outer = np.zeros(len(mesh.nodes), dtype=bool)
     outer[mesh.facets.get("skull", np.zeros((0, 3), np.int32))] = True
     return near & outer
+
+
+def _remarks(mesh: TetMesh, scene: Scene, opening: NDArray[np.bool_] | None) -> tuple[str, ...]:
+    """Say where the scene asks for what this patient's mesh does not have."""
+    remarks = []
+    if scene.septa and not any(len(mesh.facets.get(sheet, ())) for sheet in SHEETS):
+        remarks.append("the scene asks for septa, but the patient's mesh has none: the brain was solved as one body")
+    if scene.craniotomy is not None and opening is not None and not opening.any():
+        remarks.append(f"no cortex lies under the craniotomy at {scene.craniotomy.center_mm} mm: check its centre")
+    return tuple(remarks)
 
 
 @contextmanager

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.files import existing_file
+from brainshift_ros.yaml_files import read_yaml, validated
 
-SCHEMA = "brainshift/scene/1"
+_EXAMPLE = "config/scene_demo.yaml"
 
 Vector = tuple[float, float, float]
 
@@ -74,6 +73,7 @@ class Model(_Part):
 class Scene(_Part):
     """A validated scene file."""
 
+    version: Literal[1] = Field(1, description="of the scene's format; a file may leave it out")
     gravity: Gravity | None = None
     mannitol: Mannitol | None = None
     swelling: Swelling | None = None
@@ -92,18 +92,7 @@ def read_scene(path: str | Path) -> Scene:
     InputError
         The file is missing, is not YAML, or a key is unknown, missing or out of range; every fault is named.
     """
-    path = existing_file(path, "scene file (YAML)")
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(path, f"is not YAML: {error}", "see config/scene_demo.yaml for an example") from error
-    if not isinstance(content, dict):
-        raise InputError(path, "holds no keys", "see config/scene_demo.yaml for an example")
-    try:
-        scene = Scene.model_validate(content)
-    except ValidationError as error:
-        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise InputError(path, faults, "mend these keys; config/scene_demo.yaml shows them all") from error
+    scene = validated(path, Scene, read_yaml(path, "scene file", _EXAMPLE), _EXAMPLE)
     if scene.gravity is None and scene.mannitol is None and scene.swelling is None:
         raise InputError(path, "names no mechanism", "give at least one of gravity, mannitol, swelling")
     return scene

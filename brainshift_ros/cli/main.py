@@ -48,12 +48,15 @@ def brainshift() -> None:
 
 
 def main() -> None:
-    """Run the command; bad input ends with one line on stderr and exit status 2, not with a traceback."""
+    """Run the command; bad input ends with one line on stderr and status 2, a full disk or the like with one and status 1."""
     try:
         brainshift(prog_name="brainshift")
     except InputError as error:
         Console(stderr=True).print(f"brainshift: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
         sys.exit(2)
+    except OSError as error:
+        Console(stderr=True).print(f"brainshift: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
+        sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -13,16 +13,17 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.files import sha256_of_file
+from brainshift_ros.files import sha256_of_file, writable_target
 from brainshift_ros.image.io import read_volume
 from brainshift_ros.image.labels import add_tumor, labels_on_grid
 from brainshift_ros.image.landmarks import read_septa_landmarks
 from brainshift_ros.image.template import template_labels, template_landmarks, template_t1
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.mesh.build import build_patient
+from brainshift_ros.mesh.export import export_mesh
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
 from brainshift_ros.mesh.patient_file import write_patient
-from brainshift_ros.mesh.sheets import Septum, septa_from_landmarks
+from brainshift_ros.mesh.sheets import Septum, septa_from_landmarks, septa_spacing_mm
 
 _STAGES = ("surfaces", "mesh", "septa", "tissue", "cortex")
 
@@ -34,6 +35,7 @@ _STAGES = ("surfaces", "mesh", "septa", "tissue", "cortex")
 @click.option("--nodes", default=20_000, show_default=True, help="About how many nodes the mesh shall have.")
 @click.option("--septa", "septa_choice", default="none", show_default=True, metavar="none|FILE|auto", help="Dural septa.")
 @click.option("--seed", default=0, show_default=True, help="Another seed gives another mesh of the same brain.")
+@click.option("--export", type=click.Path(path_type=Path), help="Also write the mesh for other software (.vtu, .msh, ...).")
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Patient file to write (HDF5).")
 def command(
     t1_path: Path,
@@ -42,6 +44,7 @@ def command(
     nodes: int,
     septa_choice: str,
     seed: int,
+    export: Path | None,
     output: Path,
 ) -> None:
     """Mesh a brain from its T1 MR and labels, and write a patient file.
@@ -49,18 +52,21 @@ def command(
     Labels: 0 outside, 1 left cerebrum, 2 right cerebrum, 3 cerebellum, 4 brainstem, 5 tumour. A septa FILE holds the
     landmarks of falx and tentorium in mm (see config/template_mni152.yaml); `auto` takes the template's, for its own T1.
     """
-    if not output.parent.is_dir():
-        raise InputError(output, "its folder does not exist", "create the folder or choose another output path")
+    for target in (output, export):
+        if target is not None:
+            writable_target(target)
     t1 = read_volume(t1_path)
     labels = _labels(t1, t1_path, labels_path)
     if tumor_path is not None:
         labels = add_tumor(labels, read_volume(tumor_path), tumor_path)
-    septa = _septa(septa_choice, t1, t1_path)
+    septa = _septa(septa_choice, t1, t1_path, septa_spacing_mm(nodes))
     image = ImageReference(t1_path.name, sha256_of_file(t1_path), t1.shape, t1.T_patient_voxel)
     console = Console(stderr=True)
     with _progress(console) as report:
         patient = build_patient(t1, labels, septa, image_ref=image, nodes=nodes, seed=seed, progress=report)
     write_patient(output, patient)
+    if export is not None:
+        export_mesh(export, patient)
     _summarise(console, patient, output)
 
 
@@ -73,13 +79,13 @@ def _labels(t1: Volume, t1_path: Path, labels_path: Path | None) -> Volume:
     raise InputError(t1_path, problem, "give --labels with values 0 to 5, drawn in any segmentation tool")
 
 
-def _septa(choice: str, t1: Volume, t1_path: Path) -> tuple[Septum, ...]:
+def _septa(choice: str, t1: Volume, t1_path: Path, spacing_mm: float) -> tuple[Septum, ...]:
     if choice == "none":
         return ()
     if choice != "auto":
-        return septa_from_landmarks(read_septa_landmarks(choice))
+        return septa_from_landmarks(read_septa_landmarks(choice), spacing_mm)
     if _is_template(t1):
-        return septa_from_landmarks(template_landmarks().septa)
+        return septa_from_landmarks(template_landmarks().septa, spacing_mm)
     problem = "septa cannot be found on a T1 automatically in this version"
     raise InputError(t1_path, problem, "give --septa FILE with landmarks, or --septa none")
 

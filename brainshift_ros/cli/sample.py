@@ -9,6 +9,7 @@ import numpy as np
 
 from brainshift_ros.field.deformation import Deformation
 from brainshift_ros.field.field_file import read_field
+from brainshift_ros.files import writable_target
 from brainshift_ros.inverse.points_csv import DISPLACEMENT_COLUMNS, POINT_COLUMNS, read_points, write_table
 from brainshift_ros.mesh.locate import PointLocator
 from brainshift_ros.units import m_to_mm, mm_to_m
@@ -27,6 +28,7 @@ def command(field: Path, points: Path, output: Path) -> None:
     Writes x y z dx dy dz std inside, in mm. Points within 1 mm of the brain count as inside. Farther out (inside = 0) the
     displacement is that of the smooth surroundings which warped images use, and std is nan: nothing is known of it.
     """
+    writable_target(output)
     shift = read_field(field)
     positions = read_points(points)
     locator = PointLocator(shift.mesh)

@@ -10,7 +10,7 @@ import click
 
 from brainshift_ros.atlas.file import open_atlas
 from brainshift_ros.field.field_file import write_field
-from brainshift_ros.files import atomic_path
+from brainshift_ros.files import atomic_path, writable_target
 from brainshift_ros.inverse.estimate import estimate_shift
 from brainshift_ros.inverse.methods import METHODS
 from brainshift_ros.inverse.options import InverseOptions
@@ -33,6 +33,8 @@ def command(atlas: Path, points: Path, output: Path, json_path: Path | None, met
 
     Ends with status 3 if the estimate is not valid; the field is written all the same, marked as not valid.
     """
+    for target in filter(None, (output, json_path)):
+        writable_target(target)
     measured = read_homologous_points(points)
     options = replace(InverseOptions(), method=method, max_outside_mm=max_outside_mm)
     with open_atlas(atlas) as opened:

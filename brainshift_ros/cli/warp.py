@@ -10,7 +10,8 @@ from brainshift_ros.field.deformation import Deformation
 from brainshift_ros.field.field_file import read_field
 from brainshift_ros.field.itk import write_displacement_image
 from brainshift_ros.field.warp import warp_image
-from brainshift_ros.image.io import read_volume, write_volume
+from brainshift_ros.files import writable_target
+from brainshift_ros.image.io import NIFTI_SUFFIXES, read_volume, write_volume
 from brainshift_ros.units import m_to_mm
 
 
@@ -26,6 +27,8 @@ def command(field: Path, image: Path, output: Path, transform: Path | None, labe
     The transform is a NIfTI vector image in LPS mm that ITK, SimpleITK, ANTs and 3D Slicer read: it takes each point of
     the updated image to where it was before surgery, as resampling needs.
     """
+    for target in filter(None, (output, transform)):
+        writable_target(target, NIFTI_SUFFIXES)
     shift = read_field(field)
     volume = read_volume(image)
     deformation = Deformation(shift)

@@ -16,16 +16,19 @@ from brainshift_ros.field.displacement import DisplacementField
 from brainshift_ros.field.grid import Grid
 from brainshift_ros.field.itk import write_displacement_image
 from brainshift_ros.field.warp import warp_image
+from brainshift_ros.files import atomic_path
 from brainshift_ros.geometry import transform_points
 from brainshift_ros.graph import PATIENT_FRAME
 from brainshift_ros.image.io import write_volume
 from brainshift_ros.image.volume import Region, Volume
 from brainshift_ros.mesh.locate import PointLocator
 from brainshift_ros.mesh.patient import PatientModel
+from brainshift_ros.pictures.boundary import boundary_figure
 from brainshift_ros.pictures.field import displacement_map, mr_before_after, vectors_on_cortex
 from brainshift_ros.pictures.patient_page import patient_page
 from brainshift_ros.pictures.scan import scan_page
 from brainshift_ros.registration.scan import OrganisedScan
+from brainshift_ros.units import m_to_mm
 
 
 def draw_all(
@@ -58,17 +61,25 @@ def draw_all(
     displacement_map(files.folder / "displacement_mm.png", t1, forward, deformation.inside(grid), tumor)
     progress("mesh", 0.7)
     patient_page(patient, t1, files.folder / "patient.png")
+    _draw_boundary(files, case)
     progress("scan", 0.8)
     _draw_scans(files, patient, case, session)
     progress("vectors", 0.9)
     _draw_vectors(files, patient, session, field)
     jacobian, error = deformation.jacobian, deformation.inversion_error
     return {
-        "inverse_error_mm_mean": 1e3 * error.mean,
-        "inverse_error_mm_95": 1e3 * error.p95,
+        "inverse_error_mm_mean": float(m_to_mm(error.mean)),
+        "inverse_error_mm_95": float(m_to_mm(error.p95)),
         "folded_elements": jacobian.folded_elements,
         "jacobian_min": jacobian.smallest_in_brain,
     }
+
+
+def _draw_boundary(files: DemoFiles, case: RecordedCase) -> None:
+    """Draw the truth's boundary conditions, as figure 5 of the thesis does the atlas's."""
+    figure = boundary_figure(case.truth.mesh, [("truth", case.truth.solution.kinds)])
+    with atomic_path(files.folder / "boundary.png") as temporary:
+        figure.savefig(temporary, dpi=110)
 
 
 def _draw_scans(files: DemoFiles, patient: PatientModel, case: RecordedCase, session: Session) -> None:

@@ -37,7 +37,7 @@ _PACKAGES = (
     "scipy",
     "h5py",
     "scikit-fem",
-    "open3d-cpu",
+    "libigl",
     "opencv-python-headless",
     "pytetwild",
     "ros-rclpy",

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.field.grid import Grid
-from brainshift_ros.files import atomic_path, existing_file
+from brainshift_ros.files import atomic_path, existing_file, writable_target
+from brainshift_ros.geometry import T_LPS_RAS
+from brainshift_ros.image.io import NIFTI_SUFFIXES
 from brainshift_ros.units import affine_m_to_mm, affine_mm_to_m, m_to_mm, mm_to_m
 
 #: NIfTI intent: a vector at each voxel, the components along the fifth dimension.
@@ -24,7 +26,7 @@ _INTENT_VECTOR = 1007
 #: quicker to write.
 _STEPS_PER_MM = 1024.0
 
-_RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
+_RAS_TO_LPS = np.diag(T_LPS_RAS)[:3]
 
 
 def write_displacement_image(path: str | Path, vectors: NDArray, grid: Grid) -> None:
@@ -43,8 +45,9 @@ def write_displacement_image(path: str | Path, vectors: NDArray, grid: Grid) -> 
     Raises
     ------
     InputError
-        The grid is sheared.
+        The grid is sheared, or the path cannot be written to or does not end in ``.nii`` or ``.nii.gz``.
     """
+    path = writable_target(path, NIFTI_SUFFIXES)
     axes = grid.T_patient_voxel[:3, :3] / grid.voxel_edges
     if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-4:
         raise InputError(path, "the image's axes are not at right angles, which ITK cannot hold", "resample the image first")

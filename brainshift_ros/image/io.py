@@ -8,15 +8,19 @@ from pathlib import Path
 import nibabel as nib
 import numpy as np
 from nibabel.filebasedimages import ImageFileError
+from nibabel.spatialimages import HeaderDataError
 from numpy.typing import NDArray
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.files import atomic_path, existing_file
+from brainshift_ros.files import atomic_path, existing_file, writable_target
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.units import affine_m_to_mm, affine_mm_to_m
 
 #: Edge lengths of a voxel, in mm, beyond which the affine cannot be in millimetres.
 VOXEL_EDGE_RANGE_MM = (0.05, 20.0)
+
+#: What NIfTI files that hold header and voxels together are called.
+NIFTI_SUFFIXES = (".nii", ".nii.gz")
 
 # NIfTI's spatial unit codes and how many millimetres one unit is; 0 (unknown) means millimetres in practice.
 _MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
@@ -44,7 +48,7 @@ def read_volume(path: str | Path) -> Volume:
     path = existing_file(path, "NIfTI image (.nii or .nii.gz)")
     try:
         image = nib.load(path)
-    except (ImageFileError, OSError, EOFError, zlib.error, ValueError) as error:
+    except (ImageFileError, HeaderDataError, OSError, EOFError, zlib.error, ValueError) as error:
         raise InputError(path, f"is not a NIfTI image ({error})", "give a .nii or .nii.gz file") from error
     if not isinstance(image, nib.Nifti1Image):
         raise InputError(path, f"is a {type(image).__name__}, not a NIfTI image", "convert it to .nii.gz")
@@ -64,15 +68,35 @@ def read_volume(path: str | Path) -> Volume:
 
 
 def write_volume(path: str | Path, volume: Volume) -> None:
-    """Write a volume as NIfTI in millimetres, qform and sform set alike; the file appears whole or not at all."""
-    data = volume.data.astype(np.uint8) if volume.data.dtype == np.bool_ else volume.data
-    image = nib.Nifti1Image(data, affine_m_to_mm(volume.T_patient_voxel))
+    """Write a volume as NIfTI in millimetres, qform and sform set alike; the file appears whole or not at all.
+
+    Masks are written as uint8, 64-bit integers as int32 and half floats as float32: not all readers know the others.
+
+    Raises
+    ------
+    InputError
+        The path cannot be written to, or does not end in ``.nii`` or ``.nii.gz``.
+    """
+    path = writable_target(path, NIFTI_SUFFIXES)
+    image = nib.Nifti1Image(_storable(volume.data), affine_m_to_mm(volume.T_patient_voxel))
     image.header.set_xyzt_units("mm", "sec")
     image.set_sform(image.affine, code="scanner")
     # The qform cannot hold shears; nibabel then stores the closest rotation, and readers prefer the sform.
     image.set_qform(image.affine, code="scanner", strip_shears=True)
     with atomic_path(path) as temporary:
         nib.save(image, temporary)
+
+
+def _storable(data: NDArray) -> NDArray:
+    if data.dtype == np.bool_:
+        return data.astype(np.uint8)
+    if data.dtype == np.float16:
+        return data.astype(np.float32)
+    if data.dtype.kind in "iu" and data.dtype.itemsize == 8:
+        limits = np.iinfo(np.int32)
+        fits = limits.min <= data.min(initial=0) and data.max(initial=0) <= limits.max
+        return data.astype(np.int32 if fits else np.float64)
+    return data
 
 
 def _affine_m(path: Path, image: nib.Nifti1Image) -> NDArray[np.float64]:
@@ -97,7 +121,7 @@ def _affine_m(path: Path, image: nib.Nifti1Image) -> NDArray[np.float64]:
 def _voxels(path: Path, image: nib.Nifti1Image) -> NDArray:
     try:
         data = np.asanyarray(image.dataobj)
-    except (OSError, EOFError, zlib.error, ValueError) as error:
+    except (OSError, EOFError, zlib.error, ValueError, MemoryError) as error:
         raise InputError(path, f"is cut off or damaged ({error})", "copy or export the file again") from error
     if data.dtype.kind not in "uif":
         raise InputError(path, f"holds voxels of type {data.dtype}, not numbers", "give a scalar image")

@@ -10,6 +10,9 @@ from brainshift_ros.errors import InputError
 from brainshift_ros.image.resample import resample
 from brainshift_ros.image.volume import Region, Volume
 
+#: Labels stored as floats, or through a header's scale factor, may miss their integer by this much.
+ROUNDING = 1e-3
+
 
 def labels_on_grid(labels: Volume, t1: Volume, source: object = "label image") -> Volume:
     """Check a label image and bring it onto the grid of the T1 (nearest neighbour).
@@ -30,14 +33,15 @@ def labels_on_grid(labels: Volume, t1: Volume, source: object = "label image") -
     """
     values = np.unique(labels.data)
     allowed = [int(region) for region in Region]
-    strange = [float(v) for v in values if v not in allowed]
-    if strange:
-        problem = f"holds values other than 0 to {max(allowed)}: {', '.join(f'{v:g}' for v in strange[:5])}"
+    whole = np.rint(values)
+    strange = values[(np.abs(values - whole) > ROUNDING) | ~np.isin(whole, allowed)]
+    if strange.size:
+        problem = f"holds values other than 0 to {max(allowed)}: {', '.join(f'{v:g}' for v in strange[:5].astype(float))}"
         meaning = ", ".join(f"{int(r)} {r.name.lower().replace('_', ' ')}" for r in Region)
         raise InputError(source, problem, f"use {meaning}")
-    if not labels.data.any():
+    if not whole.any():
         raise InputError(source, "labels no voxel", "label the brain")
-    integral = Volume(labels.data.astype(np.uint8), labels.T_patient_voxel)
+    integral = Volume(np.rint(labels.data).astype(np.uint8), labels.T_patient_voxel)
     on_grid = resample(integral, t1, "nearest")
     expected = np.count_nonzero(integral.data) * voxel_volume(integral)
     covered = np.count_nonzero(on_grid.data) * voxel_volume(on_grid)

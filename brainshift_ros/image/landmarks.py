@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from brainshift_ros.errors import InputError
-from brainshift_ros.files import existing_file
+from brainshift_ros.yaml_files import read_yaml, validated
 
 Point = Annotated[tuple[float, float, float], Field(description="mm, RAS")]
 Polyline = Annotated[tuple[Point, ...], Field(min_length=2)]
@@ -112,7 +110,7 @@ class _SeptaFile(_Part):
     septa: SeptaLandmarks
 
 
-_Model = TypeVar("_Model", bound=BaseModel)
+_EXAMPLE = "config/template_mni152.yaml"
 
 
 def read_septa_landmarks(path: str | Path) -> SeptaLandmarks:
@@ -123,29 +121,12 @@ def read_septa_landmarks(path: str | Path) -> SeptaLandmarks:
     InputError
         Missing, not YAML, or a key is unknown, missing or out of range; every fault is named.
     """
-    content = _content(path)
-    return _validated(path, _SeptaFile, {"septa": content.get("septa", {})} if "septa" in content else content).septa
+    content = read_yaml(path, "landmark file", _EXAMPLE)
+    # A template's whole file will do: its other parts are left alone.
+    part = {"septa": content["septa"]} if "septa" in content else content
+    return validated(path, _SeptaFile, part, _EXAMPLE).septa
 
 
 def read_template_landmarks(path: str | Path) -> TemplateLandmarks:
     """Read a template's whole landmark file; errors as for :func:`read_septa_landmarks`."""
-    return _validated(path, TemplateLandmarks, _content(path))
-
-
-def _content(path: str | Path) -> dict:
-    path = existing_file(path, "landmark file (YAML)")
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(path, f"is not YAML: {error}", "see config/template_mni152.yaml for an example") from error
-    if not isinstance(content, dict):
-        raise InputError(path, "holds no landmarks", "see config/template_mni152.yaml for an example")
-    return content
-
-
-def _validated(path: str | Path, model: type[_Model], content: dict) -> _Model:
-    try:
-        return model.model_validate(content)
-    except ValidationError as error:
-        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise InputError(path, faults, "mend these keys; config/template_mni152.yaml shows them all") from error
+    return validated(path, TemplateLandmarks, read_yaml(path, "landmark file", _EXAMPLE), _EXAMPLE)

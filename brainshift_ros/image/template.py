@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import nibabel as nib
 import numpy as np
-from nilearn import datasets
 from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator, RegularGridInterpolator
 from scipy.ndimage import binary_fill_holes
@@ -16,7 +17,6 @@ from brainshift_ros.image.volume import Region, Volume
 from brainshift_ros.resources import resource
 from brainshift_ros.units import affine_mm_to_m, m_to_mm
 
-TEMPLATE_NAME = "MNI152 2009a symmetric, 1 mm (nilearn)"
 _SHEET_STEP_MM = 1.0  # the smooth sheet is tabulated at this step, then interpolated
 _LANDMARK_FILE = "config/template_mni152.yaml"
 
@@ -28,7 +28,7 @@ def template_landmarks() -> TemplateLandmarks:
 
 def template_t1() -> Volume:
     """Load the skull-stripped T1, 197 x 233 x 189 voxels of 1 mm, float32 in 0 to 1."""
-    return _volume(datasets.load_mni152_template(resolution=1), np.float32)
+    return _volume(_datasets().load_mni152_template(resolution=1), np.float32)
 
 
 def template_labels(landmarks: TemplateLandmarks) -> Volume:
@@ -42,7 +42,7 @@ def template_labels(landmarks: TemplateLandmarks) -> Volume:
     Volume
         uint8, values of :class:`Region`.
     """
-    mask = _volume(datasets.load_mni152_brain_mask(resolution=1), np.uint8)
+    mask = _volume(_datasets().load_mni152_brain_mask(resolution=1), np.uint8)
     brain = binary_fill_holes(largest_component(mask.data > 0))
     voxels = np.argwhere(brain)
     points_mm = m_to_mm(transform_points(mask.T_patient_voxel, voxels))
@@ -109,6 +109,13 @@ def _without_crumbs(
         right = landmarks.midsagittal_plane.height_mm(points_mm) >= 0.0
         data[crumbs] = np.where(right, Region.RIGHT_CEREBRUM, Region.LEFT_CEREBRUM)
     return data
+
+
+def _datasets() -> ModuleType:
+    # Imported here: it takes two seconds, and a patient with labels of their own never needs it.
+    from nilearn import datasets
+
+    return datasets
 
 
 def _volume(image: nib.Nifti1Image, dtype: type) -> Volume:

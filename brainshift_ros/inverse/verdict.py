@@ -15,6 +15,10 @@ from brainshift_ros.units import m_to_mm
 _SMALL_PATCH = 0.010
 _THIN_LINE = 0.003
 
+#: Noise alone gives displacements of 1.6 sigma in the mean (chi distribution, three degrees of freedom); a few points may
+#: reach this many.
+_NOISE_SIGMAS = 2.0
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -53,6 +57,16 @@ class Fit:
         """Mean length of the measured displacement at the points in use, metres."""
         return float(np.mean(np.linalg.norm(self.measured[self.used], axis=1)))
 
+    @property
+    def rms_sigma(self) -> float:
+        """Root mean square standard deviation of a displacement component at the points in use, metres."""
+        return float(np.sqrt(np.mean(self.sigma[self.used] ** 2)))
+
+    @property
+    def moved(self) -> bool:
+        """Whether the measured shift stands out from its noise."""
+        return self.mean_shift > _NOISE_SIGMAS * self.rms_sigma
+
 
 def reasons_against(fit: Fit, options: InverseOptions) -> tuple[str, ...]:
     """Why the estimate is not valid; empty if it is."""
@@ -65,14 +79,15 @@ def reasons_against(fit: Fit, options: InverseOptions) -> tuple[str, ...]:
     if count < 0.6 * fit.on_brain:
         reasons.append(f"{fit.on_brain - count} of {fit.on_brain} points contradict the others")
     residual = float(np.mean(fit.residuals))
-    noise = options.max_residual_sigmas * float(np.sqrt(np.mean(fit.sigma[fit.used] ** 2)))
-    gate = max(noise, options.max_residual_fraction * fit.mean_shift)
+    gate = max(options.max_residual_sigmas * fit.rms_sigma, options.max_residual_fraction * fit.mean_shift)
     if residual > gate:
         reasons.append(f"the mean residual of {m_to_mm(residual):.2f} mm exceeds the limit of {m_to_mm(gate):.2f} mm")
     if not fit.solution.kkt_residual <= options.max_kkt_residual:
         reasons.append(
             f"the solver failed: KKT residual {fit.solution.kkt_residual:.1e}, allowed {options.max_kkt_residual:.0e}"
         )
+    if fit.moved and not fit.solution.weights.any():
+        reasons.append("no atlas entry moves the points the measured way: every weight is zero")
     return tuple(reasons)
 
 
@@ -82,10 +97,8 @@ def remarks(fit: Fit) -> tuple[str, ...]:
     outliers = int((~fit.used).sum())
     if outliers:
         found.append(f"{outliers} of {fit.on_brain} points were dropped as outliers")
-    if fit.mean_shift < float(np.sqrt(np.mean(fit.sigma[fit.used] ** 2))):
-        found.append(f"the measured shift of {m_to_mm(fit.mean_shift):.2f} mm is below its own noise")
-    elif not fit.solution.weights.any():
-        found.append("no atlas entry moves the points the measured way: every weight is zero")
+    if not fit.moved:
+        found.append(f"the measured shift of {m_to_mm(fit.mean_shift):.2f} mm is not above its own noise")
     predicted = float(np.mean(np.linalg.norm(fit.estimated[fit.used], axis=1)))
     if fit.solution.saturated and predicted < 0.9 * fit.mean_shift:
         names = ", ".join(fit.solution.saturated)

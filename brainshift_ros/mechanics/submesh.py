@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from brainshift_ros.errors import InputError
+from brainshift_ros.mesh.facets import LOCAL_FACES
 from brainshift_ros.mesh.tetmesh import TetMesh
-
-#: Faces of a tetrahedron of positive volume, ordered so that the right-hand normal points outward.
-TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 SHEETS = ("falx", "tentorium")
 
@@ -51,7 +49,7 @@ def facet_owners(elements: NDArray[np.int32], facets: NDArray[np.int32]) -> NDAr
 
     Orientation tells the two elements of an inner facet apart.
     """
-    faces = _canonical(elements[:, TET_FACES].reshape(-1, 3))
+    faces = _canonical(elements[:, LOCAL_FACES].reshape(-1, 3))
     wanted = _canonical(facets)
     size = 1 + max(int(faces.max(initial=0)), int(wanted.max(initial=0)))
 
@@ -119,7 +117,7 @@ def unsupported_elements(mesh: TetMesh, removed: NDArray[np.bool_]) -> NDArray[n
     if len(brainstem) == 0:
         raise InputError("mesh", "its brainstem node set is empty, so nothing holds the brain", "give a brainstem label")
     kept = np.flatnonzero(~removed)
-    faces = np.sort(mesh.elements[kept][:, TET_FACES].reshape(-1, 3), axis=1)
+    faces = np.sort(mesh.elements[kept][:, LOCAL_FACES].reshape(-1, 3), axis=1)
     order = np.lexsort(faces.T)
     same = np.flatnonzero(np.all(faces[order[1:]] == faces[order[:-1]], axis=1))
     pairs = order[same] // 4, order[same + 1] // 4

@@ -20,9 +20,11 @@ from brainshift_ros.mesh.facets import compact, components, face_table, facet_ar
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
 from brainshift_ros.mesh.patient_file import patient_digest
 from brainshift_ros.mesh.quality import element_quality, faults, refuse_bad_mesh, relative_error_percent
+from brainshift_ros.mesh.queries import inside
+from brainshift_ros.mesh.septa_fit import check_septa
 from brainshift_ros.mesh.sheets import Septum
 from brainshift_ros.mesh.side import side_of_sheet
-from brainshift_ros.mesh.sizing import edge_length_for, inside_surface, size_field
+from brainshift_ros.mesh.sizing import edge_length_for, size_field
 from brainshift_ros.mesh.split import sheet_surfaces, split_along_septa
 from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.surfacing import decimate, face_areas, smooth_taubin, surface_of_mask
@@ -30,7 +32,7 @@ from brainshift_ros.mesh.tetmesh import TetMesh
 from brainshift_ros.mesh.tetwild import tetrahedralize
 from brainshift_ros.mesh.tissue import classify_tissue
 from brainshift_ros.mesh.volume import restore_volume
-from brainshift_ros.units import m_to_mm
+from brainshift_ros.units import m3_to_ml, m_to_mm
 
 Progress = Callable[[str, float], None]
 
@@ -38,6 +40,14 @@ NODES_RANGE = (2_000, 200_000)
 
 #: Distance, in edge lengths, by which a meshed surface may miss the given one.
 ENVELOPE = 0.2
+
+#: Blur that takes the voxels' steps off a surface: less at the tumour, which is small and loses more of its shape.
+SURFACE_BLUR_M, TUMOR_BLUR_M = 0.001, 0.0007
+
+_HEALTHY = (Region.LEFT_CEREBRUM, Region.RIGHT_CEREBRUM, Region.CEREBELLUM, Region.BRAINSTEM)
+
+#: Share of the brain, or of the tumour, that may lie apart from the rest without a word: crumbs of a drawn mask.
+CRUMBS = 0.02
 
 #: How often to mesh, each time in another frame, before a mesh that fails the gate is refused: the mesher is random.
 ATTEMPTS = 3
@@ -85,16 +95,23 @@ def build_patient(
     Raises
     ------
     InputError
-        Labels that do not fit, a mesher that fails, or a mesh that does not pass the gate of :mod:`quality`.
+        Labels or septa that do not fit, a mesher that fails, or a mesh that does not pass the gate of :mod:`quality`.
     """
     if not NODES_RANGE[0] <= nodes <= NODES_RANGE[1]:
         raise InputError("nodes", f"is {nodes}", f"give {NODES_RANGE[0]} to {NODES_RANGE[1]}")
     report = progress or (lambda stage, fraction: None)
     report("surfaces", 0.0)
     labels = labels_on_grid(labels, t1)
+    if not np.any(labels.data == Region.BRAINSTEM):
+        problem = "hold no brainstem, which is what keeps the brain in place"
+        raise InputError("labels", problem, f"label the brainstem ({int(Region.BRAINSTEM)})")
     brain = labels.data > 0
     t1, labels = cropped(t1, brain, margin=3), cropped(labels, brain, margin=3)
+    labels, warnings = _in_one_piece(labels)
+    if not septa:
+        warnings += ("no dural septa: both hemispheres and the cerebellum move as one body",)
     shapes = _shapes(labels, tuple(septa), nodes)
+    warnings += check_septa(septa, shapes.brain)
     for attempt in range(ATTEMPTS):
         report("mesh", 0.0)
         points, elements = _tetrahedra(shapes, nodes, np.random.default_rng([seed, attempt]), report)
@@ -109,7 +126,6 @@ def build_patient(
     report("cortex", 0.0)
     cortex = cortical_surface(t1, labels)
     report("cortex", 1.0)
-    warnings = () if septa else ("no dural septa: both hemispheres and the cerebellum move as one body",)
     return PatientModel(mesh, tissue, cortex, image_ref, quality, warnings, patient_digest(mesh, tissue, cortex, image_ref))
 
 
@@ -118,13 +134,28 @@ def brain_mask(labels: Volume) -> NDArray[np.bool_]:
     return ndimage.binary_fill_holes(largest_component(labels.data > 0))
 
 
+def _in_one_piece(labels: Volume) -> tuple[Volume, tuple[str, ...]]:
+    """Keep the largest piece of brain and of tumour, which the mesh follows; other tumour becomes what surrounds it."""
+    data, warnings = labels.data, []
+    brain, tumor = data > 0, data == Region.TUMOR
+    for name, mask, fate in (("brain", brain, "left out"), ("tumour", tumor, "taken as healthy tissue")):
+        apart = np.count_nonzero(mask & ~largest_component(mask))
+        if apart > CRUMBS * np.count_nonzero(mask):
+            millilitres = float(m3_to_ml(voxel_volume(labels) * apart))
+            warnings.append(f"{millilitres:.2g} ml of {name} apart from its largest piece are {fate}")
+    data = np.where(brain & ~largest_component(brain), np.uint8(Region.OUTSIDE), data)
+    pieces = (data == Region.TUMOR) & ~largest_component(data == Region.TUMOR)
+    if pieces.any():
+        data = np.where(pieces, _filled(labels, _HEALTHY).data, data)
+    return Volume(data, labels.T_patient_voxel), tuple(warnings)
+
+
 def _shapes(labels: Volume, septa: tuple[Septum, ...], nodes: int) -> _Shapes:
-    voxel = float(np.cbrt(voxel_volume(labels)))
-    brain = smooth_taubin(surface_of_mask(brain_mask(labels), labels.T_patient_voxel, blur_voxels=0.001 / voxel))
+    brain = smooth_taubin(surface_of_mask(brain_mask(labels), labels.T_patient_voxel, SURFACE_BLUR_M))
     tumor_mask = labels.data == Region.TUMOR
     tumor = None
     if tumor_mask.any():
-        tumor = smooth_taubin(surface_of_mask(largest_component(tumor_mask), labels.T_patient_voxel, 0.0007 / voxel))
+        tumor = smooth_taubin(surface_of_mask(tumor_mask, labels.T_patient_voxel, TUMOR_BLUR_M))
     edge = edge_length_for(nodes, brain, tumor)
     return _Shapes(_with_edges(brain, 0.8 * edge), tumor and _with_edges(tumor, 0.5 * edge), septa, edge)
 
@@ -153,7 +184,7 @@ def _tetrahedra(
         envelope=ENVELOPE * shapes.edge_length,
         waiting=lambda waited: report("mesh", 1.0 - np.exp(-waited / expected_s)),
     )
-    elements = elements[inside_surface(brain, points[elements].mean(axis=1))]
+    elements = elements[inside(brain, points[elements].mean(axis=1))]
     part = components(len(elements), face_table(elements).owners)
     points, elements = compact(points, elements[part == np.argmax(np.bincount(part))])
     return transform_points(invert_rigid(T_mesher_patient), points), elements
@@ -180,7 +211,7 @@ def _named_mesh(points: NDArray[np.float64], elements: NDArray[np.int32], shapes
 
 def _regions(centres: NDArray[np.float64], shapes: _Shapes, labels: Volume, near: float = 0.01) -> NDArray[np.uint8]:
     """Region of each element: the tumour by its meshed surface, sides of septa by the sheets, the rest by the labels."""
-    healthy = sample(_filled(labels, tuple(Region)[1:5]), centres, "nearest")
+    healthy = sample(_filled(labels, _HEALTHY), centres, "nearest")
     cerebral = sample(_filled(labels, (Region.LEFT_CEREBRUM, Region.RIGHT_CEREBRUM)), centres, "nearest")
     sheets = sheet_surfaces(shapes.septa)
     if "tentorium" in sheets:
@@ -195,7 +226,7 @@ def _regions(centres: NDArray[np.float64], shapes: _Shapes, labels: Volume, near
         beside &= (healthy == Region.LEFT_CEREBRUM) | (healthy == Region.RIGHT_CEREBRUM)
         healthy[beside] = np.where(side.height[beside] >= 0.0, Region.RIGHT_CEREBRUM, Region.LEFT_CEREBRUM)
     if shapes.tumor is not None:
-        healthy[inside_surface(shapes.tumor, centres)] = Region.TUMOR
+        healthy[inside(shapes.tumor, centres)] = Region.TUMOR
     return healthy
 
 
@@ -222,13 +253,13 @@ def _against_shapes(mesh: TetMesh, shapes: _Shapes, labels: Volume) -> dict[str,
     }
     if shapes.tumor is not None:
         tumor_volume = voxel * np.count_nonzero(labels.data == Region.TUMOR)
-        figures["tumor_ml"] = 1e6 * tumor_volume
+        figures["tumor_ml"] = float(m3_to_ml(tumor_volume))
         figures["tumor_volume_error_percent"] = relative_error_percent(
             float(volumes[mesh.region == Region.TUMOR].sum()), tumor_volume
         )
     for name, surface in sheet_surfaces(shapes.septa).items():
         centres = surface.vertices[surface.faces].mean(axis=1)
-        expected = face_areas(surface)[inside_surface(shapes.brain, centres)].sum()
+        expected = face_areas(surface)[inside(shapes.brain, centres)].sum()
         one_side = 0.5 * facet_areas(mesh.nodes, mesh.facets[name]).sum()
         figures[f"{name}_area_error_percent"] = relative_error_percent(one_side, float(expected))
     return figures

@@ -6,10 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from brainshift_ros.mesh.facets import LOCAL_FACES
 from brainshift_ros.mesh.tetmesh import TetMesh
-
-#: The face opposite to each corner, ordered so that its right-hand normal points out of a positive tetrahedron.
-_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 
 def boundary_faces(elements: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -27,7 +25,7 @@ def boundary_faces(elements: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int
     owner
         Shape (F,), the element of each face.
     """
-    faces = elements[:, _FACES].reshape(-1, 3).astype(np.int64)
+    faces = elements[:, LOCAL_FACES].reshape(-1, 3).astype(np.int64)
     ordered = np.sort(faces, axis=1)
     key = (ordered[:, 0] << 42) | (ordered[:, 1] << 21) | ordered[:, 2]
     _, first, counts = np.unique(key, return_index=True, return_counts=True)

@@ -37,8 +37,9 @@ def write_patient(path: str | Path, patient: PatientModel) -> None:
         image.attrs["sha256"] = patient.image.sha256
         image.attrs["shape"] = patient.image.shape
         image["T_patient_voxel"] = patient.image.T_patient_voxel
+        quality = file.create_group("quality")
         for name, value in patient.quality.items():
-            file.require_group("quality").attrs[name] = value
+            quality.attrs[name] = value
         file.attrs.create("warnings", list(patient.warnings), dtype=h5py.string_dtype())
 
 

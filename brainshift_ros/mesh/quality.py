@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from brainshift_ros.errors import InputError
 from brainshift_ros.mesh.facets import components, face_table
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.units import m3_to_ml, m_to_mm
 
 #: Figure -> (lowest, highest) value that passes.
 LIMITS: Mapping[str, tuple[float, float]] = {
@@ -49,8 +50,8 @@ def element_quality(mesh: TetMesh) -> dict[str, float]:
         "dihedral_min_deg": float(angles.min()),
         "dihedral_p01_deg": float(np.percentile(angles, 1.0)),
         "dihedral_median_deg": float(np.median(angles)),
-        "edge_median_mm": float(np.median(edges) * 1e3),
-        "volume_ml": float(volumes.sum() * 1e6),
+        "edge_median_mm": float(m_to_mm(np.median(edges))),
+        "volume_ml": float(m3_to_ml(volumes.sum())),
     }
 
 

@@ -12,12 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial import Delaunay
 
+from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import tangent_frame
 from brainshift_ros.image.landmarks import Polyline, SeptaLandmarks
 from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.units import mm_to_m
 
 SeptumName = Literal["falx", "tentorium"]
+
+#: No falx or tentorium is smaller than this from end to end.
+_SMALLEST_MM = 30.0
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,11 @@ class Septum:
     surface: Surface
 
 
+def septa_spacing_mm(nodes: int) -> float:
+    """Distance between the vertices of a sheet that suits a mesh of so many nodes: about its edge length, 5 mm at 20,000."""
+    return float(5.0 * (20_000 / nodes) ** (1.0 / 3.0))
+
+
 def septa_from_landmarks(landmarks: SeptaLandmarks, spacing_mm: float = 5.0) -> tuple[Septum, ...]:
     """Build falx, left and right tentorium.
 
@@ -48,6 +57,11 @@ def septa_from_landmarks(landmarks: SeptaLandmarks, spacing_mm: float = 5.0) -> 
         In millimetres, patient frame.
     spacing_mm
         Distance between neighbouring vertices.
+
+    Raises
+    ------
+    InputError
+        A sheet is far too small to be one, or its landmarks span none.
     """
     sinus = _polyline(landmarks.straight_sinus, spacing_mm)
     falx_edge = _polyline([sinus[-1], *landmarks.falx.outer_edge, *landmarks.falx.free_edge, sinus[0]], spacing_mm)
@@ -75,11 +89,23 @@ def sheet(ring_mm: ArrayLike, interior_mm: ArrayLike, normal: ArrayLike, spacing
         `normal` must not overlap itself.
     spacing_mm
         Distance between vertices inside.
+
+    Raises
+    ------
+    InputError
+        The edge is far too small for a septum, or the points span no sheet.
     """
     ring = np.asarray(ring_mm, dtype=np.float64)
     interior = np.asarray(interior_mm, dtype=np.float64).reshape(-1, 3)
+    extent = float(np.linalg.norm(np.ptp(ring, axis=0)))
+    if extent < _SMALLEST_MM:
+        problem = f"a sheet measures {extent:.3g} mm from end to end"
+        raise InputError("septa landmarks", problem, "give falx and tentorium of a human head, in mm")
     R = tangent_frame(normal)
     ring_local, known = ring @ R.T, np.vstack([ring, interior]) @ R.T
+    # The spline's matrix would be singular, which its solver does not always notice.
+    if len(np.unique(known[:, :2].round(3), axis=0)) < len(known):
+        raise InputError("septa landmarks", "two points of a sheet lie above each other", "remove repeated points")
     height = RBFInterpolator(known[:, :2], known[:, 2], kernel="thin_plate_spline")
     polygon = Polygon(ring_local[:, :2])
     grid = _triangular_grid(ring_local[:, :2], spacing_mm)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 import pyvista as pv
 from numpy.typing import NDArray
 
+from brainshift_ros.mesh.queries import closest_points
 from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.mesh.surfacing import polydata
+from brainshift_ros.mesh.surfacing import polydata, vertex_normals
 
 
 @dataclass(frozen=True)
@@ -35,16 +35,11 @@ def side_of_sheet(sheet: Surface, points: NDArray[np.float64]) -> SideOfSheet:
     The normal at the closest point is interpolated from the vertices (area weighted), so a closest point on an edge or
     a ridge has one too (Baerentzen and Aanaes 2005).
     """
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(sheet.vertices.astype(np.float32), sheet.faces.astype(np.uint32))
-    hit = scene.compute_closest_points(points.astype(np.float32), nthreads=1)
-    u, v = hit["primitive_uvs"].numpy().astype(np.float64).T
-    corners = sheet.faces[hit["primitive_ids"].numpy().astype(np.int64)]
-    weights = np.stack([1.0 - u - v, u, v], axis=1)
-    closest = np.einsum("ni,nik->nk", weights, sheet.vertices[corners])
-    normals = np.einsum("ni,nik->nk", weights, _vertex_normals(sheet)[corners])
+    found = closest_points(sheet, points)
+    weights, corners = found.barycentric, sheet.faces[found.face]
+    normals = np.einsum("ni,nik->nk", weights, vertex_normals(sheet.vertices, sheet.faces)[corners])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    offset = points - closest
+    offset = points - found.position
     height = np.einsum("nk,nk->n", offset, normals)
     at_edge = _on_edge(sheet)[corners]
     # the closest point is on the sheet's edge if every corner that carries weight is
@@ -58,13 +53,6 @@ def merged(sheets: list[Surface]) -> Surface:
     poly = pv.merge([polydata(s) for s in sheets], merge_points=False)
     poly = poly.extract_surface(algorithm=None).clean(tolerance=1e-7, absolute=True)
     return Surface(np.asarray(poly.points, dtype=np.float64), np.asarray(poly.regular_faces, dtype=np.int32))
-
-
-def _vertex_normals(sheet: Surface) -> NDArray[np.float64]:
-    a, b, c = np.moveaxis(sheet.vertices[sheet.faces], 1, 0)
-    normals = np.zeros_like(sheet.vertices)
-    np.add.at(normals, sheet.faces.ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
 
 
 def _on_edge(sheet: Surface) -> NDArray[np.bool_]:

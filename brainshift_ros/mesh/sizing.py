@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
+from brainshift_ros.mesh.queries import closest_points, inside
 from brainshift_ros.mesh.surface import Surface
 
 #: Edge length at the tumour's surface, relative to that far away, and the distance over which it grows.
@@ -67,7 +67,7 @@ def size_field(brain: Surface, tumor: Surface | None, edge_length: float, spacin
     low, high = brain.vertices.min(axis=0) - margin, brain.vertices.max(axis=0) + margin
     axes = [np.arange(a, b + spacing, spacing) for a, b in zip(low, high, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    outside = np.where(inside_surface(brain, points), 0.0, _distance(brain, points))
+    outside = np.where(inside(brain, points), 0.0, closest_points(brain, points).distance)
     edge = edge_length * relative_edge(points, tumor) + OUTSIDE_GROWTH * outside
     edge = np.minimum(edge, LARGEST_EDGE * edge_length)
     return SizeField(points, _kuhn_tetrahedra(tuple(len(a) for a in axes)), edge)
@@ -82,30 +82,13 @@ def edge_length_for(nodes: int, brain: Surface, tumor: Surface | None) -> float:
     spacing = 0.004
     axes = [np.arange(a, b, spacing) for a, b in zip(brain.vertices.min(axis=0), brain.vertices.max(axis=0), strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    points = points[inside_surface(brain, points)]
+    points = points[inside(brain, points)]
     volume = spacing**3 * np.sum(relative_edge(points, tumor) ** -3.0)
 
     def surplus(edge: float) -> float:
         return _NODES_PER_VOLUME * volume / edge**3 + _NODES_PER_SURFACE * volume ** (2 / 3) / edge**2 - nodes
 
     return float(brentq(surplus, 1e-4, 0.1))
-
-
-def inside_surface(surface: Surface, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether points (n, 3) lie inside a closed surface."""
-    # Several rays a point: one ray may slip through an edge.
-    occupancy = _scene(surface).compute_occupancy(points.astype(np.float32), nthreads=1, nsamples=3)
-    return occupancy.numpy() > 0.5
-
-
-def _distance(surface: Surface, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    return _scene(surface).compute_distance(points.astype(np.float32), nthreads=1).numpy().astype(np.float64)
-
-
-def _scene(surface: Surface) -> o3d.t.geometry.RaycastingScene:
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(surface.vertices.astype(np.float32), surface.faces.astype(np.uint32))
-    return scene
 
 
 def _kuhn_tetrahedra(counts: tuple[int, ...]) -> NDArray[np.int32]:

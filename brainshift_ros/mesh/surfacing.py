@@ -11,11 +11,12 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.geometry import transform_points
+from brainshift_ros.geometry import transform_points, unit
+from brainshift_ros.mesh.facets import facet_areas
 from brainshift_ros.mesh.surface import Surface
 
 
-def surface_of_mask(mask: NDArray[np.bool_], T_patient_voxel: NDArray[np.float64], blur_voxels: float = 0.0) -> Surface:
+def surface_of_mask(mask: NDArray[np.bool_], T_patient_voxel: NDArray[np.float64], blur: float = 0.0) -> Surface:
     """Close triangle surface around a mask, by marching cubes at one half (Lewiner et al. 2003).
 
     Parameters
@@ -24,8 +25,8 @@ def surface_of_mask(mask: NDArray[np.bool_], T_patient_voxel: NDArray[np.float64
         Shape (I, J, K); may touch the border of the grid.
     T_patient_voxel
         4x4, metres.
-    blur_voxels
-        Standard deviation of a Gaussian over the mask beforehand; it takes the stair steps away.
+    blur
+        Standard deviation, metres, of a Gaussian over the mask beforehand; it takes the stair steps away.
 
     Raises
     ------
@@ -34,9 +35,10 @@ def surface_of_mask(mask: NDArray[np.bool_], T_patient_voxel: NDArray[np.float64
     """
     if not mask.any():
         raise InputError("mask", "is empty, so it has no surface", "give a mask with voxels in it")
-    pad = 2 + round(3 * blur_voxels)
+    blur_voxels = blur / np.linalg.norm(T_patient_voxel[:3, :3], axis=0)  # voxels of a slab scan are longer across slices
+    pad = 2 + round(3 * float(blur_voxels.max()))
     field = np.pad(mask.astype(np.float32), pad)
-    if blur_voxels > 0.0:
+    if blur > 0.0:
         field = ndimage.gaussian_filter(field, blur_voxels)
     return isosurface(field, 0.5, T_patient_voxel, pad)
 
@@ -74,8 +76,20 @@ def enclosed_volume(surface: Surface) -> float:
 
 def face_areas(surface: Surface) -> NDArray[np.float64]:
     """Area of each face, m^2."""
-    a, b, c = np.moveaxis(surface.vertices[surface.faces], 1, 0)
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return facet_areas(surface.vertices, surface.faces)
+
+
+def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Area-weighted unit normals, shape (V, 3); vertices without a face get +z."""
+    corners = vertices[faces]
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(vertices, dtype=np.float64)
+    for axis in range(3):
+        for corner in range(3):
+            normals[:, axis] += np.bincount(faces[:, corner], face_normals[:, axis], minlength=len(vertices))
+    length = np.linalg.norm(normals, axis=1)
+    normals[length < 1e-15] = (0.0, 0.0, 1.0)
+    return unit(normals)
 
 
 def polydata(surface: Surface) -> pv.PolyData:

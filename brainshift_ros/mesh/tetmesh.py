@@ -8,13 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-#: Facet names that a mesh may carry. `skull` is the outer boundary; `falx` and `tentorium` hold the facets of *both* sides
-#: of the split sheets; `tumor` is the interface between tumour and brain, oriented out of the tumour.
-FACET_SETS = ("skull", "falx", "tentorium", "tumor")
-
-#: Node sets that a mesh may carry. Rims are the free inner edges of the sheets, where the two sides stay joined.
-NODE_SETS = ("brainstem", "falx_rim", "tentorium_rim")
-
 
 @dataclass(frozen=True)
 class TetMesh:
@@ -30,9 +23,11 @@ class TetMesh:
         Shape (M,), :class:`brainshift_ros.image.volume.Region` of each element.
     facets
         Named facets, each of shape (F, 3), node indices, ordered so that the right-hand normal points out of the
-        element that owns the facet.
+        element that owns the facet: ``skull``, the outer boundary; ``falx`` and ``tentorium``, both sides of the split
+        sheets; ``tumor``, the interface between tumour and brain, oriented out of the tumour.
     node_sets
-        Named node sets, each of shape (n,).
+        Named node sets, each of shape (n,): ``brainstem``; ``falx_rim`` and ``tentorium_rim``, the free inner edges of
+        the sheets, where the two sides stay joined.
     """
 
     nodes: NDArray[np.float64]

@@ -94,7 +94,8 @@ def _run_worker(given: Path, made: Path, timeout_s: float, waiting: Callable[[fl
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "brainshift_ros.mesh.tetwild_worker", str(given), str(made)]
     with open(made.with_suffix(".log"), "w+b") as log:
-        process = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
+        # fTetWild leaves files of its own (__tracked_surface.stl) where it runs: let that be the folder that goes.
+        process = subprocess.Popen(command, cwd=given.parent, env=environment, stdout=log, stderr=subprocess.STDOUT)
         start = time.monotonic()
         try:
             while process.poll() is None:

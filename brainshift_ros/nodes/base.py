@@ -91,6 +91,11 @@ class BrainshiftNode(Node):
         """Publish a message on a topic that the graph declares for this node."""
         self._publishers_by_topic[topic.name].publish(to_message(topic.type, plain))
 
+    def withdraw(self, topic: Topic) -> None:
+        """Take back what a latched topic carried last: who joins from now on gets nothing until the next message."""
+        self.destroy_publisher(self._publishers_by_topic[topic.name])
+        self._publishers_by_topic[topic.name] = self._publisher(topic)
+
     def serve(self, name: str, answer: Callable[[Any, Any], Any]) -> None:
         """Offer a service ``~/name`` that the graph declares for this node; `answer` may be a coroutine function."""
         declared = next(item for item in graph.SERVICES if (item.node, item.name) == (self.get_name(), name))

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import ArrayLike, NDArray
 
 from brainshift_ros.errors import InputError
@@ -18,6 +17,7 @@ from brainshift_ros.registration.icp import IcpFit, robust_icp, tukey_weight
 from brainshift_ros.registration.opening import opening_mask
 from brainshift_ros.registration.scan import OrganisedScan
 from brainshift_ros.registration.target import CortexTarget, prepare_target
+from brainshift_ros.registration.thinning import voxel_means
 from brainshift_ros.registration.verdict import Evidence, Gates, judge, plane_residuals, skew
 from brainshift_ros.units import m_to_mm, mm_to_m
 
@@ -158,8 +158,7 @@ def register_scan(
     target = cortex if isinstance(cortex, CortexTarget) else prepare_target(cortex)
     opening = opening_mask(scan)
     points = scan.points[opening].astype(np.float64)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    clouds = [np.asarray(cloud.voxel_down_sample(float(mm_to_m(voxel))).points) for voxel in options.voxels_mm]
+    clouds = [voxel_means(points, float(mm_to_m(voxel)))[0] for voxel in options.voxels_mm]
     times = {"prepare": time.perf_counter() - clock}
 
     clock = time.perf_counter()

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.registration.exposure import open_fraction
+from brainshift_ros.registration.thinning import voxel_means
 
 _SPACING_M = 1.2e-3
-_RAYS = 24
 _OPEN_FRACTION = 0.12
 
 
@@ -25,23 +25,13 @@ class CortexTarget:
     ----------
     points, normals
         Shape (n, 3), patient frame, metres; outward unit normals.
-    cloud
-        The same as an Open3D cloud.
     tree
         KD-tree over `points`.
     """
 
     points: NDArray[np.float64]
     normals: NDArray[np.float64]
-    cloud: o3d.geometry.PointCloud
     tree: cKDTree
-
-
-def _sphere_directions(count: int) -> NDArray[np.float64]:
-    """Fibonacci sphere: `count` nearly even unit vectors."""
-    k = np.arange(count) + 0.5
-    z, angle = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
-    return np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=-1)
 
 
 def prepare_target(cortex: Surface) -> CortexTarget:
@@ -65,37 +55,28 @@ def prepare_target(cortex: Surface) -> CortexTarget:
     extent = float(np.ptp(vertices, axis=0).max())
     if not 0.05 <= extent <= 0.4:
         raise InputError("cortex surface", f"it extends over {extent:.3g} m", "give it in metres (a head is 0.1 to 0.3 m)")
-    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(cortex.faces))
-    mesh.compute_vertex_normals()
-    cloud = _mesh_samples(mesh, cortex)
-    points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
-    directions = _sphere_directions(_RAYS)
-    starts = points + 0.3e-3 * normals  # off the surface, so that a ray does not meet its own triangle
-    open_count = np.zeros(len(points))
-    for direction in directions:
-        rays = np.concatenate([starts, np.broadcast_to(direction, starts.shape)], axis=1).astype(np.float32)
-        open_count += ~scene.test_occlusions(o3d.core.Tensor(rays)).numpy()
-    exposed = open_count >= _OPEN_FRACTION * _RAYS
+    points, normals = _samples(cortex)
+    exposed = open_fraction(cortex, points, normals) >= _OPEN_FRACTION
     if exposed.sum() < 100:
         raise InputError("cortex surface", "no part of it can be seen from outside", "check that its normals point outward")
-    cloud = cloud.select_by_index(np.flatnonzero(exposed).tolist())
-    points = np.asarray(cloud.points).copy()
-    return CortexTarget(points, np.asarray(cloud.normals).copy(), cloud, cKDTree(points))
+    return CortexTarget(points[exposed], normals[exposed], cKDTree(points[exposed]))
 
 
-def _mesh_samples(mesh: o3d.geometry.TriangleMesh, cortex: Surface) -> o3d.geometry.PointCloud:
-    """Vertices and face centres, thinned to the spacing: even coverage for fine and coarse surfaces, no random numbers."""
-    corners = np.asarray(mesh.vertices)[cortex.faces]
-    mesh.compute_triangle_normals()
-    cloud = o3d.geometry.PointCloud()
-    cloud.points = o3d.utility.Vector3dVector(np.concatenate([np.asarray(mesh.vertices), corners.mean(axis=1)]))
-    cloud.normals = o3d.utility.Vector3dVector(
-        np.concatenate([np.asarray(mesh.vertex_normals), np.asarray(mesh.triangle_normals)])
+def _samples(cortex: Surface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Vertices and face centres with normals, thinned to the spacing: even coverage for fine and coarse surfaces."""
+    corners = cortex.vertices[cortex.faces]
+    twice_area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    vertex_normals = np.stack(
+        [
+            np.bincount(cortex.faces.ravel(), weights=np.repeat(column, 3), minlength=len(cortex.vertices))
+            for column in twice_area.T
+        ],
+        axis=-1,
     )
-    thinned = cloud.voxel_down_sample(_SPACING_M)
-    normals = np.asarray(thinned.normals)
+    normals = np.concatenate([vertex_normals, twice_area])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
+    points, normals = voxel_means(np.concatenate([cortex.vertices, corners.mean(axis=1)]), _SPACING_M, normals)
     length = np.linalg.norm(normals, axis=1)
     # Opposite walls of a closed sulcus fall into one voxel: their mean normal means nothing.
-    return thinned.select_by_index(np.flatnonzero(length > 0.3).tolist()).normalize_normals()
+    kept = length > 0.3
+    return points[kept], normals[kept] / length[kept, None]

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import tangent_frame, transform_points, unit
+from brainshift_ros.mesh.queries import RayCaster
 from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.mesh.surfacing import vertex_normals
 
 _HULL_SPACING_M = 1.5e-3
 _HULL_CLOSING_M = 15e-3
@@ -45,29 +46,6 @@ class Craniotomy:
         return -T[:3, :3].T @ T[:3, 3]
 
 
-def ray_scene(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> o3d.t.geometry.RaycastingScene:
-    """Ray casting scene with one triangle mesh in it."""
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
-        o3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
-    )
-    return scene
-
-
-def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Area-weighted unit normals, shape (V, 3); vertices without a face get +z."""
-    corners = vertices[faces]
-    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(vertices, dtype=np.float64)
-    for axis in range(3):
-        for corner in range(3):
-            normals[:, axis] += np.bincount(faces[:, corner], face_normals[:, axis], minlength=len(vertices))
-    length = np.linalg.norm(normals, axis=1)
-    normals[length < 1e-15] = (0.0, 0.0, 1.0)
-    return unit(normals)
-
-
 def place_craniotomy(cortex: Surface, center: ArrayLike, diameter_m: float) -> Craniotomy:
     """Put a round craniotomy on the cortex point closest to `center`.
 
@@ -96,9 +74,8 @@ def place_craniotomy(cortex: Surface, center: ArrayLike, diameter_m: float) -> C
     # Sulcal walls face each other, so that their normals cancel and the gyral crowns decide.
     axis = unit(normals[near].sum(axis=0))
     # The crown below the wanted centre: seen along the axis from outside.
-    scene = ray_scene(cortex.vertices, cortex.faces)
     start = wanted + 0.1 * axis
-    hit = scene.cast_rays(o3d.core.Tensor(np.r_[start, -axis][None].astype(np.float32)))["t_hit"].numpy()[0]
+    hit = float(RayCaster(cortex).cast(start, -axis).distance)
     origin = start - hit * axis if np.isfinite(hit) else cortex.vertices[np.argmin(distance)]
     T = np.eye(4)
     T[:3, :3] = tangent_frame(axis)
@@ -119,10 +96,9 @@ def hull_height(
     n = 2 * round(half_width_m / _HULL_SPACING_M) + 1
     axis = np.linspace(-half_width_m, half_width_m, n)
     x, y = np.meshgrid(axis, axis)
-    scene = ray_scene(transform_points(craniotomy.T_craniotomy_patient, cortex.vertices), cortex.faces)
+    local = Surface(transform_points(craniotomy.T_craniotomy_patient, cortex.vertices), cortex.faces)
     top = 0.1
-    rays = np.stack([x, y, np.full_like(x, top), np.zeros_like(x), np.zeros_like(x), -np.ones_like(x)], axis=-1)
-    hit = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy().astype(np.float64)
+    hit = RayCaster(local).cast(np.stack([x, y, np.full_like(x, top)], axis=-1), (0.0, 0.0, -1.0)).distance
     height = np.where(np.isfinite(hit), np.maximum(top - hit, _HULL_LOWEST_M), _HULL_LOWEST_M)
     size = 2 * round(0.5 * _HULL_CLOSING_M / _HULL_SPACING_M) + 1
     hull = ndimage.gaussian_filter(ndimage.grey_closing(height, size=(size, size)), 3e-3 / _HULL_SPACING_M)

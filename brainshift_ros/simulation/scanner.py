@@ -7,14 +7,15 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import invert_rigid, transform_points, unit
 from brainshift_ros.graph import TRACKER_FRAME
+from brainshift_ros.mesh.queries import RayCaster, RayHits
 from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.mesh.surfacing import vertex_normals
 from brainshift_ros.registration.scan import OrganisedScan
 from brainshift_ros.simulation.craniotomy import (
     Craniotomy,
@@ -22,7 +23,6 @@ from brainshift_ros.simulation.craniotomy import (
     hull_height,
     make_surround,
     place_craniotomy,
-    vertex_normals,
 )
 from brainshift_ros.simulation.texture import CortexTexture, paint_texture, smooth_noise
 from brainshift_ros.simulation.vessels import PaintedVessel, grow_vessels
@@ -163,24 +163,11 @@ def scanner_pose(
     return T
 
 
-def _cast(scene: SurgicalScene, displaced: NDArray[np.float64], origin: NDArray[np.float64], rays: NDArray[np.float64]) -> dict:
-    caster = o3d.t.geometry.RaycastingScene()
-    for vertices, faces in ((displaced, scene.cortex.faces), (scene.surround.surface.vertices, scene.surround.surface.faces)):
-        caster.add_triangles(
-            o3d.core.Tensor((vertices - scene.craniotomy.center).astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
-        )
-    start = np.broadcast_to(origin - scene.craniotomy.center, rays.shape)
-    hits = caster.cast_rays(o3d.core.Tensor(np.concatenate([start, rays], axis=-1).astype(np.float32)))
-    return {name: hits[name].numpy() for name in ("geometry_ids", "primitive_ids", "primitive_uvs")}
-
-
 def _interpolate(
-    values: NDArray[np.float64], faces: NDArray[np.int32], hits: dict, where: NDArray[np.bool_]
+    values: NDArray[np.float64], faces: NDArray[np.int32], hits: RayHits, first_face: int, where: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Vertex values at the hit points, shape (k, ...), for the pixels `where`."""
-    corners = values[faces[hits["primitive_ids"][where]]]
-    u, v = hits["primitive_uvs"][where].astype(np.float64).T
-    return np.einsum("kc,kcd->kd", np.stack([1 - u - v, u, v], axis=-1), corners)
+    """Interpolate vertex values at the hit points of the pixels `where`, shape (k, ...); `faces` begin at `first_face`."""
+    return np.einsum("kc,kcd->kd", hits.barycentric[where], values[faces[hits.face[where] - first_face]])
 
 
 def take_scan(
@@ -228,21 +215,25 @@ def take_scan(
 
     origin = T_patient_scanner[:3, 3]
     rays = scanner.rays() @ T_patient_scanner[:3, :3].T
-    hits = _cast(scene, displaced, origin, rays)
+    surround, cortex_faces = scene.surround.surface, len(scene.cortex.faces)
+    everything = Surface(
+        np.vstack([displaced, surround.vertices]), np.vstack([scene.cortex.faces, surround.faces + len(displaced)])
+    )
+    hits = RayCaster(everything).cast(origin, rays)
     shape = rays.shape[:2]
-    on_cortex, on_surround = hits["geometry_ids"] == 0, hits["geometry_ids"] == 1
+    on_surround = hits.face >= cortex_faces
+    on_cortex = (hits.face >= 0) & ~on_surround
     position, normal, material = (np.full((*shape, 3), np.nan) for _ in range(3))
-    surround = scene.surround.surface
-    for where, vertices, faces in (
-        (on_cortex, displaced, scene.cortex.faces),
-        (on_surround, surround.vertices, surround.faces),
+    for where, vertices, faces, first_face in (
+        (on_cortex, displaced, scene.cortex.faces, 0),
+        (on_surround, surround.vertices, surround.faces, cortex_faces),
     ):
-        position[where] = _interpolate(vertices, faces, hits, where)
-        normal[where] = unit(_interpolate(vertex_normals(vertices, faces), faces, hits, where))
-    material[on_cortex] = _interpolate(undeformed, scene.cortex.faces, hits, on_cortex)
+        position[where] = _interpolate(vertices, faces, hits, first_face, where)
+        normal[where] = unit(_interpolate(vertex_normals(vertices, faces), faces, hits, first_face, where))
+    material[on_cortex] = _interpolate(undeformed, scene.cortex.faces, hits, 0, on_cortex)
 
     albedo = scene.texture(transform_points(scene.craniotomy.T_craniotomy_patient, material)[..., :2])
-    albedo[on_surround] = _interpolate(scene.surround.color, surround.faces, hits, on_surround)
+    albedo[on_surround] = _interpolate(scene.surround.color, surround.faces, hits, cortex_faces, on_surround)
     rgb, specular = _shade(albedo, normal, rays, scanner, on_cortex, rng)
     rgb[~(on_cortex | on_surround)] = 0
 

@@ -97,7 +97,12 @@ def displacement_markers(
         }
         for number, fraction in enumerate((0.0, 0.25, 0.5, 0.75, 1.0))
     ]
-    return {"markers": [{**common, "ns": "", "id": 0, "type": _ARROW, "action": _DELETE_ALL}, *arrows, *scale]}
+    return {"markers": [_delete_all(stamp_ns), *arrows, *scale]}
+
+
+def no_markers(stamp_ns: int) -> Plain:
+    """Plain MarkerArray that clears a display of every arrow and text of an earlier field."""
+    return {"markers": [_delete_all(stamp_ns)]}
 
 
 def spread_out(nodes: NDArray[np.floating], candidates: NDArray[np.integer], count: int) -> NDArray[np.integer]:
@@ -114,6 +119,11 @@ def spread_out(nodes: NDArray[np.floating], candidates: NDArray[np.integer], cou
         if len(first) <= count:
             return candidates[np.sort(first)]
         cell *= 1.1
+
+
+def _delete_all(stamp_ns: int) -> Plain:
+    placed = {"header": header(str(DISPLACEMENT_MARKERS.frame), stamp_ns), "pose": _NO_ROTATION}
+    return {**placed, "ns": "", "id": 0, "type": _ARROW, "action": _DELETE_ALL}
 
 
 def _colour(fraction: float) -> Plain:

@@ -12,7 +12,7 @@ from brainshift_ros.correspondence.homologous import HomologousPoints
 from brainshift_ros.errors import InputError
 from brainshift_ros.field.displacement import DisplacementField
 from brainshift_ros.graph import DISPLACEMENT_FIELD, HOMOLOGOUS_POINTS, Topic
-from brainshift_ros.wire.cloud import plain_cloud, read_columns
+from brainshift_ros.wire.cloud import field_names, plain_cloud, read_columns
 from brainshift_ros.wire.plain import Plain, check_finite, check_frame, check_reach, stamp_ns
 
 #: A brain surface sinks by at most about 5 cm (thesis, table 9 and chapter II); beyond this, units or signs are wrong.
@@ -61,6 +61,28 @@ def encode_homologous(measured: HomologousPoints, stamp_ns: int) -> Plain:
     """Plain PointCloud2 of homologous points."""
     table = np.column_stack([measured.points, measured.displacements, measured.sigma])
     return _encode(table, (*_VECTOR, "sigma"), HOMOLOGOUS_POINTS, stamp_ns)
+
+
+def encode_withdrawal(stamp_ns: int) -> Plain:
+    """Plain PointCloud2 without points: the measurement of the case before no longer counts."""
+    nothing = np.zeros((0, 3))
+    return encode_homologous(HomologousPoints(nothing, nothing, np.zeros(0)), stamp_ns)
+
+
+def decode_measurement(message: Any, topic: Topic = HOMOLOGOUS_POINTS) -> StampedPoints | None:
+    """Homologous points, or None where a well-formed empty cloud takes the earlier ones back (a new case has begun).
+
+    Raises
+    ------
+    InputError
+        As :func:`decode_homologous`.
+    """
+    withdrawn = int(message.width) == 0 and len(message.data) == 0 and field_names(message) == [*_VECTOR, "sigma"]
+    if not withdrawn:
+        return decode_homologous(message, topic)
+    check_frame(message, topic)
+    stamp_ns(message, topic)
+    return None
 
 
 def decode_field(message: Any, topic: Topic = DISPLACEMENT_FIELD) -> FieldSamples:
