@@ -32,5 +32,5 @@ def export_mesh(path: str | Path, patient: PatientModel) -> None:
     with atomic_path(path) as temporary:
         try:
             meshio.write(temporary, exported)
-        except meshio.WriteError as error:
-            raise InputError(path, f"meshio cannot write it ({error})", "choose a suffix such as .vtu or .msh") from error
+        except (meshio.WriteError, meshio.ReadError) as error:
+            raise InputError(path, f"meshio cannot write it ({type(error).__name__})", "choose a suffix such as .vtu or .msh") from error
