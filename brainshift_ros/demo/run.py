@@ -28,6 +28,7 @@ from brainshift_ros.field.displacement import DisplacementField
 from brainshift_ros.field.field_file import write_field
 from brainshift_ros.files import atomic_path
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.runner import require_ros
 
 #: Called with the stage's name and the fraction of it that is done.
 Progress = Callable[[str, float], None]
@@ -78,6 +79,7 @@ def run_demo(scene: Scene, settings: DemoSettings, folder: Path, progress: Progr
     progress
         Stage and fraction of it.
     """
+    require_ros()  # before minutes of work, not after them
     folder.mkdir(parents=True, exist_ok=True)
     files = DemoFiles(folder)
     stages = _Stages(progress)

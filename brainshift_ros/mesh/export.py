@@ -33,4 +33,6 @@ def export_mesh(path: str | Path, patient: PatientModel) -> None:
         try:
             meshio.write(temporary, exported)
         except (meshio.WriteError, meshio.ReadError) as error:
-            raise InputError(path, f"meshio cannot write it ({type(error).__name__})", "choose a suffix such as .vtu or .msh") from error
+            raise InputError(
+                path, f"meshio cannot write it ({type(error).__name__})", "choose a suffix such as .vtu or .msh"
+            ) from error

@@ -1,7 +1,7 @@
 """Which points of a surface can be seen from outside it: height maps along many directions (shadow maps, Williams 1978).
 
-A ray tracer does the same with exact triangles, but the one at hand takes three seconds to import, more than a restarted
-node may spend; at the resolution that registration needs, the two agree.
+Rays would do the same with exact triangles, in several times the time, which a restarted node has not; at the resolution
+that registration needs, the two agree.
 """
 
 from __future__ import annotations
