@@ -17,6 +17,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
 from brainshift_ros.files import atomic_path
+from brainshift_ros.geometry import unit
 from brainshift_ros.image.resample import sample
 from brainshift_ros.image.volume import Region, Volume
 from brainshift_ros.mesh.patient import PatientModel, Tissue
@@ -138,6 +139,10 @@ def _name_plane(axes: Axes, axis: int, at: float) -> None:
     axes.set_ylabel(f"{vertical} (mm, RAS)")
 
 
+#: Where the light comes from; of length one, else a facet that faces it would be brighter than white.
+_LIGHT = unit([-0.7, -0.3, 0.65])
+
+
 def _draw_septa_in_space(axes: Axes3D, patient: PatientModel) -> None:
     mesh = patient.mesh
     skull = mesh.facets["skull"]
@@ -149,7 +154,7 @@ def _draw_septa_in_space(axes: Axes3D, patient: PatientModel) -> None:
     for facets, colour, alpha in parts:
         triangles = m_to_mm(mesh.nodes[facets])
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-        light = np.abs(normals @ [-0.7, -0.3, 0.65]) / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+        light = np.abs(normals @ _LIGHT) / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
         shade = np.outer(0.45 + 0.55 * light, to_rgb(colour))
         axes.add_collection3d(Poly3DCollection(triangles, facecolors=np.column_stack([shade, np.full(len(shade), alpha)])))
     low, high = m_to_mm(mesh.nodes.min(axis=0)), m_to_mm(mesh.nodes.max(axis=0))
