@@ -23,7 +23,8 @@ from brainshift_ros.units import mm_to_m
 
 #: Times of the recording: any fixed moment serves, and a fixed one gives the same bag each time.
 FIRST_SCAN_NS = 1_700_000_000_000_000_000
-BETWEEN_SCANS_NS = 8_000_000_000
+POSE_BEFORE_SCAN_NS = 500_000_000
+BETWEEN_SCANS_NS = 4_000_000_000
 
 #: The scanned cortex is extracted otherwise than the registration's target (3.0 and 0.8 mm), and differs from it by what an
 #: MR and its segmentation get wrong: a smooth error along the normal.
@@ -104,7 +105,7 @@ def simulate_case(
 def write_case(case: RecordedCase, files: DemoFiles) -> None:
     """Write initial pose and both scans as a bag."""
     with BagWriter(files.case_bag, replace=True) as bag:
-        bag.add_initial_pose(case.T_patient_tracker_initial, FIRST_SCAN_NS - BETWEEN_SCANS_NS // 2)
+        bag.add_initial_pose(case.T_patient_tracker_initial, FIRST_SCAN_NS - POSE_BEFORE_SCAN_NS)
         bag.add_scan(case.first.scan)
         bag.add_scan(case.later.scan)
 
