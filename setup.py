@@ -23,7 +23,7 @@ setup(
     version=namespace["__version__"],
     description="Atlas-based brain shift compensation for image-guided neurosurgery (research software)",
     license="Apache-2.0",
-    python_requires=">=3.11,<3.13",
+    python_requires=">=3.11,<3.14",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={PACKAGE: ["py.typed", "**/*.json"]},
     data_files=[

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 
-SUPPORTED = ("3.12", "3.11")
+SUPPORTED = ("3.13", "3.12", "3.11")
 HERE = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 VENV = os.path.join(HERE, ".venv")
 VENV_PYTHON = os.path.join(VENV, "bin", "python")
@@ -37,7 +37,7 @@ def find_python():
             return path
     return fail(
         f"no supported Python ({' or '.join(SUPPORTED)}) on PATH; python3 is {version_of(sys.executable)}",
-        "install one (Debian 12: python3 is 3.11, Ubuntu 24.04: 3.12), or put python3.11 or python3.12 on PATH",
+        "install one (Debian 12 has 3.11, Debian 13 has 3.13, Ubuntu 24.04 has 3.12), or put one on PATH",
     )
 
 

@@ -38,7 +38,7 @@ def test_an_unsupported_python_is_named_with_what_to_install(bootstrap, tmp_path
     old = _fake_python(tmp_path, "python3", "echo 3.9")
     monkeypatch.setattr(bootstrap.sys, "executable", str(old))
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(SystemExit, match=r"no supported Python \(3\.12 or 3\.11\) on PATH; python3 is 3\.9") as end:
+    with pytest.raises(SystemExit, match=r"no supported Python \(3\.13 or 3\.12 or 3\.11\) on PATH; python3 is 3\.9") as end:
         bootstrap.main()
     assert "install one" in str(end.value)
 
