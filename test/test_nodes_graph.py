@@ -319,5 +319,6 @@ def test_killed_nodes_recover(case):
         case.running.start(name)
     # A client that knew the killed node is answered by its successor.
     case.reset(again_s=2.0)
+    case.probe.has_settled("atlas_loader", "lrs")
     # Replayed from a new process: this one may still count the killed subscriber among those it is matched with.
     assert_same(case.replay()[0], case.field)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -21,7 +20,7 @@ from brainshift_ros.graph import Topic
 from brainshift_ros.nodes.health import Health, Level
 from brainshift_ros.nodes.messages import message_class, to_message
 from brainshift_ros.nodes.qos import PROFILES
-from brainshift_ros.nodes.stopping import ros_until_stopped
+from brainshift_ros.nodes.stopping import leave, ros_until_stopped, withdraw
 from brainshift_ros.nodes.worker import Worker
 from brainshift_ros.wire.plain import Plain
 
@@ -126,11 +125,10 @@ class BrainshiftNode(Node):
 
         self.worker.submit(key or condition, job, done)
 
-    def shut_down(self) -> bool:
-        """Stop the background threads; True if one of them is still in the middle of a job."""
+    def shut_down(self) -> None:
+        """Let the background threads take no further job."""
         for worker in self._workers:
             worker.stop()
-        return any(worker.busy for worker in self._workers)
 
     def guarded(self, condition: str, action: Callable[[], object]) -> bool:
         """Call `action`; turn any exception into a diagnostic. True if all went well."""
@@ -177,15 +175,13 @@ class BrainshiftNode(Node):
 
 def spin(factory: Callable[[], BrainshiftNode]) -> None:
     """Run a node until SIGINT or SIGTERM; the process ends with status 0 and without a traceback."""
-    with ros_until_stopped() as stop:
-        node = factory()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        while not stop.is_set():
-            executor.spin_once()  # the heartbeat ends it after 0.4 s at the latest
-        busy = node.shut_down()
-        executor.shutdown()
-        node.destroy_node()
-    if busy:
-        # A job in native code would be torn down under the interpreter's feet; nothing is left to be saved.
-        os._exit(0)
+    stop = ros_until_stopped()
+    node = factory()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while not stop.is_set():
+        executor.spin_once()  # the heartbeat ends it after 0.4 s at the latest
+    node.shut_down()
+    executor.shutdown()
+    withdraw(node)
+    leave(0)

@@ -206,10 +206,10 @@ class InverseNode(BrainshiftNode):
         response.message = str(error or result.result())
         return response
 
-    def shut_down(self) -> bool:
+    def shut_down(self) -> None:
         """Also end the process that warps."""
         self._warper.stop()
-        return super().shut_down()
+        super().shut_down()
 
 
 def _check_unchanged(atlas: OpenedAtlas) -> None:

@@ -16,7 +16,7 @@ from brainshift_ros.bags import BagWriter
 from brainshift_ros.graph import Topic
 from brainshift_ros.nodes.messages import message_class
 from brainshift_ros.nodes.qos import PROFILES
-from brainshift_ros.nodes.stopping import ros_until_stopped
+from brainshift_ros.nodes.stopping import ros_until_stopped, withdraw
 from brainshift_ros.nodes.tool import run_tool
 
 POLL_S = 0.1
@@ -53,7 +53,8 @@ def command(out: Path, names: tuple[str, ...], goals: tuple[str, ...], timeout: 
     wanted = {topic.name: count for topic, count in map(_goal, goals)}
     topics = graph.topics_named(names) or list(graph.TOPICS)
     topics += [topic for topic in graph.topics_named(list(wanted)) if topic not in topics]
-    with ros_until_stopped() as stop, BagWriter(out, replace=replace) as bag:
+    stop = ros_until_stopped()
+    with BagWriter(out, replace=replace) as bag:
         met = _record(bag, topics, wanted, timeout, stop)
     print(f"recorded {sum(bag.counts.values())} messages into {out}", flush=True)
     if not met:
@@ -69,13 +70,15 @@ def _record(bag: BagWriter, topics: list[Topic], wanted: dict[str, int], timeout
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     print(f"recording {len(topics)} topics", flush=True)
+    met = not wanted
     while not stop.is_set():
-        if wanted and all(bag.counts.get(name, 0) >= count for name, count in wanted.items()):
+        met = all(bag.counts.get(name, 0) >= count for name, count in wanted.items())
+        if (wanted and met) or (deadline is not None and time.monotonic() > deadline):
             break
-        if deadline is not None and time.monotonic() > deadline:
-            return not wanted
         executor.spin_once(timeout_sec=POLL_S)
-    return True
+    executor.shutdown()
+    withdraw(node)
+    return met or stop.is_set()
 
 
 def _goal(text: str) -> tuple[Topic, int]:

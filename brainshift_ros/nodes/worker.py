@@ -28,15 +28,8 @@ class Worker:
         self._waiting: OrderedDict[str, tuple[Callable[[], Any], Callable[[Future[Any]], None]]] = OrderedDict()
         self._finished: list[tuple[Callable[[Future[Any]], None], Future[Any]]] = []
         self._condition = threading.Condition()
-        self._busy = False
         self._stopped = False
         threading.Thread(target=self._run, name="worker", daemon=True).start()
-
-    @property
-    def busy(self) -> bool:
-        """Whether a job runs or waits."""
-        with self._condition:
-            return self._busy or bool(self._waiting)
 
     def submit(self, key: str, job: Callable[[], Any], done: Callable[[Future[Any]], None]) -> None:
         """Queue a job; `done` gets its finished future in the executor's thread."""
@@ -66,14 +59,12 @@ class Worker:
                 if self._stopped:
                     return
                 _, (job, done) = self._waiting.popitem(last=False)
-                self._busy = True
             future: Future[Any] = Future()
             try:
                 future.set_result(job())
             except BaseException as error:  # handed over: the node reports it
                 future.set_exception(error)
             with self._condition:
-                self._busy = False
                 self._finished.append((done, future))
                 if self._stopped:
                     return
