@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from brainshift_ros.h5 import digest
-from brainshift_ros.image.template import template_landmarks
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.mesh.build import build_patient
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
-from brainshift_ros.mesh.sheets import septa_from_landmarks
+from brainshift_ros.mesh.septa_template import septa_from_template
 from brainshift_ros.mesh.template_patient import template_patient_images
 
 
@@ -28,5 +27,5 @@ def small_patient(template_case: tuple[Volume, Volume]) -> PatientModel:
     """A patient model of about 3,000 nodes with tumour and split septa."""
     t1, labels = template_case
     image = ImageReference("template.nii.gz", digest(t1.data), t1.shape, t1.T_patient_voxel)
-    septa = septa_from_landmarks(template_landmarks().septa, spacing_mm=9.0)
+    septa = septa_from_template(lambda points: points, spacing_mm=9.0)
     return build_patient(t1, labels, septa, image_ref=image, nodes=3_000)

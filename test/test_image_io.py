@@ -9,6 +9,8 @@ import nibabel as nib
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from brainshift_ros.errors import InputError
@@ -16,7 +18,8 @@ from brainshift_ros.geometry import T_LPS_RAS, transform_points
 from brainshift_ros.image.io import read_volume, write_volume
 from brainshift_ros.image.resample import resample, sample
 from brainshift_ros.image.volume import Volume
-from brainshift_ros.units import m_to_mm
+from brainshift_ros.simulation.synthetic_grid import reoriented
+from brainshift_ros.units import affine_mm_to_m, m_to_mm, mm_to_m
 
 ORIENTATIONS = [(p, s) for p in permutations(range(3)) for s in product((1, -1), repeat=3)]
 
@@ -52,6 +55,35 @@ def test_landmark_lies_where_simpleitk_puts_it(tmp_path: Path, turn: Rotation | 
 
         point_lps_mm = transform_points(T_LPS_RAS, m_to_mm(transform_points(volume.T_patient_voxel, found)))
         np.testing.assert_allclose(point_lps_mm, expected_lps, atol=1e-4)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    order=st.permutations(range(3)),
+    signs=st.tuples(*[st.sampled_from([1, -1])] * 3),
+    angles=st.tuples(*[st.floats(-180.0, 180.0)] * 3),
+    point_mm=st.tuples(*[st.floats(-4.0, 4.0)] * 3),
+)
+def test_storage_does_not_change_what_lies_where(order: list[int], signs: tuple, angles: tuple, point_mm: tuple) -> None:
+    """However the axes are permuted and flipped, left-right included, a point of the patient has one value."""
+    T = affine_mm((0, 1, 2), (1, 1, 1), Rotation.from_euler("xyz", angles, degrees=True))
+    volume = Volume(np.random.default_rng(0).uniform(size=(12, 12, 12)), affine_mm_to_m(T))
+    point = transform_points(volume.T_patient_voxel, [5.5, 5.5, 5.5]) + mm_to_m(point_mm)
+    other = reoriented(volume, order, signs)
+    assert sample(other, point) == pytest.approx(sample(volume, point), abs=1e-9)
+    on_grid = resample(other, volume, "nearest")
+    np.testing.assert_array_equal(on_grid.data, volume.data)
+
+
+def test_left_right_flipped_files_give_the_same_image(tmp_path: Path) -> None:
+    data = np.random.default_rng(0).uniform(1, 2, (5, 6, 7)).astype(np.float32)
+    neurological = affine_mm((0, 1, 2), (1, 1, 1))
+    radiological = neurological @ np.diag([-1.0, 1.0, 1.0, 1.0])
+    radiological[:3, 3] += neurological[:3, 0] * 4
+    one = read_volume(saved(tmp_path / "n.nii.gz", data, neurological))
+    other = read_volume(saved(tmp_path / "r.nii.gz", data[::-1].copy(), radiological))
+    assert np.linalg.det(other.T_patient_voxel) < 0.0 < np.linalg.det(one.T_patient_voxel)
+    np.testing.assert_array_equal(resample(other, one, "nearest").data, one.data)
 
 
 def test_written_file_is_read_alike_by_simpleitk(tmp_path: Path) -> None:
@@ -92,27 +124,37 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
     singular.header["qform_code"] = 0
     singular._affine = singular.header.get_sform()
     nib.save(singular, folder / "singular.nii.gz")
+    mirrored = nib.Nifti1Image(ones, affine)
+    mirrored.set_sform(np.diag([-1.0, 1.0, 1.0, 1.0]), code=1)
+    mirrored.set_qform(affine, code=1)
+    nib.save(mirrored, folder / "mirrored.nii.gz")
+    colour = np.zeros((8, 8, 8), dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")])
     header = bytearray(saved(folder / "plain.nii", ones, affine).read_bytes())
     header[70:72] = (9999).to_bytes(2, "little")  # a data type that does not exist
     (folder / "header.nii").write_bytes(header)
     return {
         "header": (folder / "header.nii", "is not a NIfTI image"),
         "missing": (folder / "nowhere.nii.gz", "no such file"),
-        "folder": (folder, "is a folder"),
+        "folder": (folder, "holds no DICOM image"),
         "foreign": (text, "is not a NIfTI image"),
         "cut": (cut, "cut off"),
         "4-D": (saved(folder / "4d.nii.gz", np.ones((4, 4, 4, 3), np.float32), affine), "three dimensions"),
+        "slice": (saved(folder / "slice.nii.gz", np.ones((8, 8, 1), np.float32), affine), "a single slice"),
         "placeless": (folder / "placeless.nii.gz", "neither a qform nor an sform"),
         "singular": (folder / "singular.nii.gz", "singular"),
         "zero": (saved(folder / "zero.nii.gz", 0 * ones, affine), "every voxel is zero"),
         "nan": (saved(folder / "nan.nii.gz", nan, affine), "1 of 512 voxels are not finite"),
+        "mirrored": (folder / "mirrored.nii.gz", "qform and sform mirror each other"),
+        "colour": (saved(folder / "colour.nii.gz", colour, affine), "not numbers"),
         "unit": (saved(folder / "unit.nii.gz", ones, np.diag([0.001, 0.001, 0.001, 1.0])), "which no head MR has"),
     }
 
 
-@pytest.mark.parametrize(
-    "fault", ["header", "missing", "folder", "foreign", "cut", "4-D", "placeless", "singular", "zero", "nan", "unit"]
-)
+FORMAT_FAULTS = ["header", "missing", "folder", "foreign", "cut", "4-D", "slice", "zero", "nan", "colour"]
+AFFINE_FAULTS = ["placeless", "singular", "mirrored", "unit"]
+
+
+@pytest.mark.parametrize("fault", FORMAT_FAULTS + AFFINE_FAULTS)
 def test_fault_is_one_clear_error(tmp_path: Path, fault: str) -> None:
     path, text = bad_files(tmp_path)[fault]
     with pytest.raises(InputError) as error:

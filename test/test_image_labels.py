@@ -6,15 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.geometry import transform_points
-from brainshift_ros.image.labels import add_tumor, cropped, labels_on_grid
+from brainshift_ros.geometry import rigid, transform_points
+from brainshift_ros.image.labels import add_tumor, cropped, edge_warnings, labels_on_grid
 from brainshift_ros.image.landmarks import read_septa_landmarks, read_template_landmarks
 from brainshift_ros.image.resample import sample
 from brainshift_ros.image.tumor import TumorShape, draw_tumor
 from brainshift_ros.image.volume import Region, Volume
 from brainshift_ros.resources import resource
+from brainshift_ros.simulation.synthetic_grid import reoriented
 from brainshift_ros.units import mm_to_m
 
 T = np.diag([0.002, 0.002, 0.002, 1.0])
@@ -59,6 +63,62 @@ def test_tumour_mask_faults() -> None:
         add_tumor(ball(), ball(center=24.0, radius=5.0))
     tumor = add_tumor(ball(), ball(radius=4.0))
     np.testing.assert_array_equal(tumor.data == Region.TUMOR, ball(radius=4.0).data > 0)
+
+
+def test_several_tumours_are_kept() -> None:
+    two = Volume(ball(9.0, 3.0).data | ball(20.0, 2.5).data, T)
+    labels = add_tumor(ball(radius=14.0), two)
+    np.testing.assert_array_equal(labels.data == Region.TUMOR, two.data > 0)
+    third = add_tumor(labels, ball(15.0, 2.0))
+    np.testing.assert_array_equal(third.data == Region.TUMOR, (two.data | ball(15.0, 2.0).data) > 0)
+
+
+def test_a_tumour_of_a_few_voxels_is_kept_or_refused_with_the_reason() -> None:
+    few = np.zeros_like(ball().data)
+    few[15, 15, 14:17] = 1
+    assert np.count_nonzero(add_tumor(ball(), Volume(few, T)).data == Region.TUMOR) == 3
+    between = np.zeros((120, 120, 120), np.uint8)
+    between[61, 61, 61] = 1  # on a grid four times as fine, between the voxels of the labels
+    fine = Volume(between, T @ np.diag([0.25, 0.25, 0.25, 1.0]))
+    with pytest.raises(InputError, match=r"marks 1 voxel\(s\), so little that none"):
+        add_tumor(ball(), fine)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    angles=st.tuples(*[st.floats(-45.0, 45.0)] * 3),
+    edges_mm=st.tuples(st.floats(0.8, 1.6), st.floats(0.8, 1.6), st.floats(0.8, 3.0)),
+    order=st.permutations(range(3)),
+)
+def test_labels_and_tumours_come_from_any_grid(angles: tuple, edges_mm: tuple, order: list[int]) -> None:
+    """A ball drawn on an oblique, anisotropic grid keeps its place and, within the voxels' size, its volume."""
+    shape = np.ceil(70.0 / np.array(edges_mm)).astype(int)
+    T_other = rigid(Rotation.from_euler("xyz", angles, degrees=True), [0.03, 0.03, 0.03]) @ np.diag([*mm_to_m(edges_mm), 1.0])
+    T_other[:3, 3] -= T_other[:3, :3] @ (0.5 * (shape - 1))
+    points = transform_points(T_other, np.moveaxis(np.indices(tuple(shape)), 0, -1))
+    distance = np.linalg.norm(points - 0.03, axis=-1)
+    drawn = reoriented(Volume((distance < 0.02).astype(np.uint8), T_other), order)
+    tumor = reoriented(Volume(distance < 0.010, T_other), order, (-1, 1, -1))
+    labels = add_tumor(labels_on_grid(drawn, ball()), tumor)
+    for radius_m, mask in ((0.02, labels.data > 0), (0.010, labels.data == Region.TUMOR)):
+        assert np.count_nonzero(mask) * 8e-9 == pytest.approx(4 / 3 * np.pi * radius_m**3, rel=0.15)
+        centre = transform_points(T, np.argwhere(mask).mean(axis=0))
+        np.testing.assert_allclose(centre, 0.03, atol=0.001)
+
+
+def test_image_that_ends_inside_the_brain_is_said() -> None:
+    whole = ball()
+    assert edge_warnings(whole) == ()
+    cut = Volume(whole.data[:, :, :18], T)
+    (warning,) = edge_warnings(cut)
+    area_cm2 = np.count_nonzero(cut.data[:, :, -1]) * 0.04
+    assert warning.startswith(f"the image's superior edge cuts the brain over {area_cm2:.1f} cm^2")
+    (flipped,) = edge_warnings(reoriented(cut, (2, 0, 1), (-1, 1, -1)))
+    assert flipped == warning
+    (left,) = edge_warnings(Volume(whole.data[12:], T))
+    assert "left" in left
+    stem = Volume(np.where(whole.data > 0, np.uint8(Region.BRAINSTEM), np.uint8(0))[:, :, 12:], T)
+    assert edge_warnings(stem) == ()
 
 
 def test_cropping_keeps_places() -> None:

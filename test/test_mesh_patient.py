@@ -52,12 +52,12 @@ def test_size_and_quality(small_patient: PatientModel, template_case: tuple[Volu
     mesh = small_patient.mesh
     assert 0.8 * 3000 < len(mesh.nodes) < 1.2 * 3000
     assert (mesh.volumes > 0).all()
-    assert dihedral_angles_deg(mesh.nodes, mesh.elements).min() >= 5
+    assert dihedral_angles_deg(mesh.nodes, mesh.elements).min() >= 10
     _, labels = template_case
     voxel = 8e-9
-    assert mesh.volumes.sum() == pytest.approx(voxel * np.count_nonzero(labels.data), rel=0.02)
+    assert mesh.volumes.sum() == pytest.approx(voxel * np.count_nonzero(labels.data), rel=0.01)
     tumor = mesh.region == Region.TUMOR
-    assert mesh.volumes[tumor].sum() == pytest.approx(voxel * np.count_nonzero(labels.data == Region.TUMOR), rel=0.05)
+    assert mesh.volumes[tumor].sum() == pytest.approx(voxel * np.count_nonzero(labels.data == Region.TUMOR), rel=0.03)
     np.testing.assert_array_equal(np.unique(mesh.elements), np.arange(len(mesh.nodes)))
 
 
@@ -98,7 +98,7 @@ def test_sheets_follow_the_landmarks(small_patient: PatientModel, name: str) -> 
     distance = np.abs(side_of_sheet(surface, mesh.nodes[np.unique(mesh.facets[name])]).height)
     assert np.median(distance) < 0.0015
     assert np.percentile(distance, 95) < 0.004
-    assert small_patient.quality[f"{name}_area_error_percent"] < 10
+    assert small_patient.quality[f"{name}_area_error_percent"] < 5
 
 
 def test_split_nodes_coincide_and_rims_are_shared(small_patient: PatientModel) -> None:
@@ -159,17 +159,17 @@ def test_cortex_lies_on_the_mesh(small_patient: PatientModel) -> None:
 
 
 def test_sheet_through_a_grid_doubles_exactly_its_nodes() -> None:
-    grid = MeshTet.init_tensor(*[np.linspace(-1, 1, 5)] * 3)
+    grid = MeshTet.init_tensor(*[np.linspace(-0.1, 0.1, 5)] * 3)
     nodes, elements = grid.p.T.copy(), grid.t.T.astype(np.int32)
     x = nodes[elements]
     negative = np.linalg.det(x[:, 1:] - x[:, :1]) < 0
     elements[negative] = elements[negative][:, [1, 0, 2, 3]]
-    ring = np.array([[0, -2000, 0], [0, 2000, 0], [0, 2000, 2000], [0, -2000, 2000]], float)  # x = 0, z > 0, in mm
-    septum = Septum("falx", sheet(ring, (), (1, 0, 0), spacing_mm=500.0))
+    ring = np.array([[0, -120, 0], [0, 120, 0], [0, 120, 120], [0, -120, 120]], float)  # x = 0, z > 0, in mm
+    septum = Septum("falx", sheet(ring, (), (1, 0, 0), spacing_mm=50.0))
     split = split_along_septa(nodes, elements, [septum])
     plane = (nodes[:, 0] == 0) & (nodes[:, 2] > 0)
     assert len(split.nodes) == len(nodes) + np.count_nonzero(plane)
-    assert facet_areas(split.nodes, split.facets["falx"]).sum() == pytest.approx(2 * 2.0)
+    assert facet_areas(split.nodes, split.facets["falx"]).sum() == pytest.approx(2 * 0.02)
     np.testing.assert_allclose(split.nodes[split.rims["falx"]][:, [0, 2]], 0.0)
     assert len(split.rims["falx"]) == 5
     np.testing.assert_allclose(split.nodes[split.elements], nodes[elements])

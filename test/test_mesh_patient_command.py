@@ -37,25 +37,38 @@ def test_labels_and_tumour_mask_make_a_patient_without_septa(
     write_volume(tmp_path / "labels.nii.gz", Volume(healthy, t1.T_patient_voxel))
     write_volume(tmp_path / "tumor.nii.gz", Volume(tumor[window], T_mask))  # on a grid of its own
     output = tmp_path / "patient.h5"
-    options = ("--labels", tmp_path / "labels.nii.gz", "--tumor", tmp_path / "tumor.nii.gz", "--nodes", 2000, "--seed", 1)
+    options = (
+        "--labels",
+        tmp_path / "labels.nii.gz",
+        "--tumor",
+        tmp_path / "tumor.nii.gz",
+        "--nodes",
+        2000,
+        "--seed",
+        1,
+        "--septa",
+        "none",
+    )
 
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
-    run(tmp_path / "t1.nii.gz", *options, "-o", output)
+    run(tmp_path / "t1.nii.gz", *options, "--nodes", 2000, "--seed", 1, "-o", output)
     assert not list(elsewhere.iterdir())
 
     patient = read_patient(output)
     mesh = patient.mesh
+    assert (tmp_path / "patient.png").stat().st_size > 100_000
+    assert patient.template_map is None
     assert patient.image.sha256 == sha256_of_file(tmp_path / "t1.nii.gz")
     assert 0.8 * 2000 < len(mesh.nodes) < 1.2 * 2000
     assert set(mesh.facets) == {"skull", "tumor"}
     assert any("septa" in warning for warning in patient.warnings)
-    assert any("1.7 ml of tumour apart from its largest piece" in warning for warning in patient.warnings)
+    assert patient.quality["tumor_pieces"] == 2
     assert len(cKDTree(mesh.nodes).query_pairs(1e-9)) == 0
-    # the same tumour as that drawn into the labels, in another mesh of the same brain
+    # beside the second, the same tumour as that drawn into the labels, in another mesh of the same brain
     other = small_patient.mesh
-    volume = mesh.volumes[mesh.region == Region.TUMOR].sum()
+    volume = mesh.volumes[mesh.region == Region.TUMOR].sum() - 6**3 * 8e-9
     assert volume == pytest.approx(other.volumes[other.region == Region.TUMOR].sum(), rel=0.02)
     distance, _ = cKDTree(other.nodes).query(mesh.nodes)
     assert np.median(distance) > 0.001
@@ -66,21 +79,22 @@ def test_what_cannot_be_done_is_said(tmp_path: Path, template_case: tuple[Volume
     write_volume(tmp_path / "t1.nii.gz", t1)
     write_volume(tmp_path / "labels.nii.gz", labels)
     target = ("-o", tmp_path / "p.h5")
-    given = (tmp_path / "t1.nii.gz", "--labels", tmp_path / "labels.nii.gz")
-    with pytest.raises(InputError, match="no label image was given"):
-        run(tmp_path / "t1.nii.gz", *target)
+    given = (tmp_path / "t1.nii.gz", "--labels", tmp_path / "labels.nii.gz", "--septa", "none")
     with pytest.raises(InputError, match="no such file"):
         run(tmp_path / "other.nii.gz", *target)
     with pytest.raises(InputError, match="its folder does not exist"):
         run(*given, "-o", tmp_path / "nowhere" / "p.h5")
-    with pytest.raises(InputError, match="septa cannot be found"):
-        run(*given, "--septa", "auto", *target)
+    elsewhere = np.diag([1e-3, 1e-3, 1e-3, 1.0])
+    elsewhere[:3, 3] = 0.5
+    write_volume(tmp_path / "elsewhere.nii.gz", Volume(np.ones((9, 9, 9), dtype=np.uint8), elsewhere))
+    with pytest.raises(InputError, match=r"elsewhere\.nii\.gz: marks no voxel of the T1"):
+        run(*given, "--tumor", tmp_path / "elsewhere.nii.gz", *target)
     with pytest.raises(InputError, match="no such file"):
         run(*given, "--septa", tmp_path / "septa.yaml", *target)
     with pytest.raises(InputError, match="holds values other than"):
-        run(tmp_path / "t1.nii.gz", "--labels", tmp_path / "t1.nii.gz", *target)
+        run(tmp_path / "t1.nii.gz", "--labels", tmp_path / "t1.nii.gz", "--septa", "none", *target)
     headless = np.where(labels.data == Region.BRAINSTEM, Region.CEREBELLUM, labels.data).astype(np.uint8)
     write_volume(tmp_path / "no_stem.nii.gz", Volume(headless, labels.T_patient_voxel))
     with pytest.raises(InputError, match="hold no brainstem"):
-        run(tmp_path / "t1.nii.gz", "--labels", tmp_path / "no_stem.nii.gz", *target)
+        run(tmp_path / "t1.nii.gz", "--labels", tmp_path / "no_stem.nii.gz", "--septa", "none", *target)
     assert not (tmp_path / "p.h5").exists()

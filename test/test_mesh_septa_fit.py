@@ -46,6 +46,22 @@ def test_a_sheet_elsewhere_is_refused(brain: Surface) -> None:
         check_septa(falx(200.0), brain)
 
 
+def test_an_attached_edge_that_ends_inside_is_said(brain: Surface) -> None:
+    (whole,) = falx()
+    edge = np.flatnonzero(np.isclose(whole.surface.vertices[:, 2], mm_to_m(50.0))).astype(np.int32)
+    (warning,) = check_septa((Septum("falx", whole.surface, edge),), brain)
+    # the edge's middle lies 50 mm from the centre of a ball of 75 mm
+    said = re.search(r"100% of the falx's attached edge ends inside the brain, up to (\S+) mm", warning)
+    assert said is not None
+    assert float(said[1]) == pytest.approx(25.0, abs=0.5)
+
+
+def test_a_periphery_that_crosses_itself_is_refused() -> None:
+    ring = np.array([[0.0, -50.0, -50.0], [0.0, 50.0, -50.0], [0.0, -50.0, 50.0], [0.0, 50.0, 50.0]])
+    with pytest.raises(InputError, match="crosses itself near"):
+        sheet(ring, (), (1.0, 0.0, 0.0), 5.0)
+
+
 def test_landmarks_in_metres_or_twice_are_refused() -> None:
     with pytest.raises(InputError, match=r"measures 0\.1\d* mm from end to end"):
         falx(scale=0.001)

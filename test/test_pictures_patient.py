@@ -18,5 +18,5 @@ def test_a_septum_that_faces_the_light_is_drawn(small_patient, template_case, tm
     normal = unit(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
     turn, _ = Rotation.align_vectors([unit([-0.7, -0.3, 0.65])], [normal])
     turned = replace(small_patient, mesh=replace(mesh, nodes=turn.apply(mesh.nodes)))
-    patient_page(turned, template_case[0], tmp_path / "page.png")
+    patient_page(turned, *template_case, tmp_path / "page.png")
     assert imread(tmp_path / "page.png")[..., :3].std() > 0.1

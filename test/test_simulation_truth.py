@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from brainshift_ros.atlas.orientations import directions_in_cone
-from brainshift_ros.simulation.targets import target_groups
+from brainshift_ros.mesh.queries import closest_points
+from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.simulation.targets import MIDLINE_M, target_groups
 from brainshift_ros.simulation.truth import direction_between, simulate_truth, smooth_random_field
 
 UP = np.array([0.0, -0.94, -0.34]) / np.hypot(0.94, 0.34)
@@ -37,7 +39,8 @@ def test_the_random_field_has_unit_variance_and_its_correlation_length():
 
 def test_a_truth_differs_by_seed_and_repeats_by_seed(small_patient):
     first, again, other = (simulate_truth(small_patient, UP, 0.5, seed=seed) for seed in (1, 1, 2))
-    assert np.array_equal(first.solution.displacement, again.solution.displacement)
+    # Not to the last bit: the solver's threads add up in an order of their own.
+    assert again.solution.displacement == pytest.approx(first.solution.displacement, abs=1e-10)
     assert not np.allclose(first.solution.displacement, other.solution.displacement, atol=1e-5)
 
 
@@ -61,5 +64,6 @@ def test_targets_are_where_their_names_say(small_patient):
     # Elements below the falx belong to a side by their centroid, so a corner may cross the midline by less than an edge.
     edge = small_patient.quality["edge_median_mm"] / 1000.0
     assert (mesh.nodes[groups["contralateral"], 0] > -edge).all()
-    assert (np.abs(mesh.nodes[groups["midline"], 0]) < 0.012).all()
+    falx = Surface(mesh.nodes, mesh.facets["falx"])
+    assert closest_points(falx, mesh.nodes[groups["midline"]]).distance.max() <= MIDLINE_M
     assert len(np.intersect1d(groups["subsurface"], groups["deep"])) == 0

@@ -17,11 +17,11 @@ from brainshift_ros.atlas.file import AtlasContent, write_atlas
 from brainshift_ros.atlas.scene import Craniotomy, Scene
 from brainshift_ros.files import writable_target
 from brainshift_ros.mechanics.many import ManySolver
-from brainshift_ros.mechanics.materials import material_of
+from brainshift_ros.mechanics.materials import TABLE_1, Material, TissueProperties, material_of
 from brainshift_ros.mechanics.solvers import SolverName
 from brainshift_ros.mechanics.submesh import SHEETS
 from brainshift_ros.mechanics.system import System, assemble_system
-from brainshift_ros.mesh.patient import PatientModel
+from brainshift_ros.mesh.patient import PatientModel, Tissue
 from brainshift_ros.mesh.tetmesh import TetMesh
 from brainshift_ros.units import mm_to_m
 
@@ -71,6 +71,7 @@ def build_atlas(
     scene: Scene,
     output: str | Path,
     *,
+    materials: Mapping[Tissue, TissueProperties] = TABLE_1,
     solver: SolverName = "auto",
     progress: Progress | None = None,
 ) -> BuildReport:
@@ -84,6 +85,8 @@ def build_atlas(
         What acts; decides the entries.
     output
         The atlas file; written whole or not at all.
+    materials
+        Properties of each tissue; the file keeps them.
     solver
         ``auto``, ``pardiso`` or ``scipy``.
     progress
@@ -98,6 +101,7 @@ def build_atlas(
     """
     report = progress if progress is not None else _silent
     entries = entries_of(scene)
+    material = material_of(patient.tissue, materials)
     writable_target(output)
     E = np.empty((len(patient.mesh.nodes), 3, len(entries)), dtype=np.float32)
     times_s: dict[str, float] = {}
@@ -108,9 +112,9 @@ def build_atlas(
         def report_state(stage: str, fraction: float, number: int = number) -> None:
             report(stage, (number + fraction) / len(resection_states))
 
-        states.append(_solve_state(patient, scene, entries, resected, E, solver, times_s, report_state))
+        states.append(_solve_state(patient, material, scene, entries, resected, E, solver, times_s, report_state))
     report("write", 1.0)
-    content = AtlasContent(patient.patient_id, patient.mesh, patient.tissue, scene, entries, groups_of(entries))
+    content = AtlasContent(patient.patient_id, patient.mesh, patient.tissue, scene, entries, groups_of(entries), materials)
     with _timed(times_s, "write"):
         atlas_id = write_atlas(output, content, E)
     shift = np.sqrt(np.einsum("ncm,ncm->nm", E, E))  # no copy of E, which may fill much of the memory
@@ -139,6 +143,7 @@ class _StateReport:
 
 def _solve_state(
     patient: PatientModel,
+    material: Material,
     scene: Scene,
     entries: Sequence[AtlasEntry],
     resected: bool,
@@ -153,7 +158,6 @@ def _solve_state(
     cases = [entries[column] for column in columns]
     report(f"assemble, {name}", 0.0)
     with _timed(times_s, "assemble"):
-        material = material_of(patient.tissue)
         system = assemble_system(patient.mesh, material, resected=resected, septa=scene.septa, solver=solver)
     report(f"factorise, {name}", 0.2)
     with _timed(times_s, "factorise"):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -20,6 +20,8 @@ from brainshift_ros.atlas.scene import Scene
 from brainshift_ros.errors import InputError
 from brainshift_ros.files import atomic_path
 from brainshift_ros.h5 import digest, open_checked, read_mesh, write_header, write_mesh
+from brainshift_ros.mechanics.materials import TABLE_1, TissueProperties
+from brainshift_ros.mesh.patient import Tissue
 from brainshift_ros.mesh.tetmesh import TetMesh
 
 KIND = "atlas"
@@ -59,6 +61,8 @@ class AtlasContent:
         Parameters of each column.
     groups
         Columns whose weights share a sum limit.
+    materials
+        Properties of each tissue.
     """
 
     patient_id: str
@@ -67,6 +71,7 @@ class AtlasContent:
     scene: Scene
     entries: tuple[AtlasEntry, ...]
     groups: tuple[WeightGroup, ...]
+    materials: Mapping[Tissue, TissueProperties] = field(default_factory=lambda: TABLE_1)
 
 
 def write_atlas(path: str | Path, content: AtlasContent, E: NDArray[np.float32]) -> str:
@@ -101,6 +106,7 @@ def write_atlas(path: str | Path, content: AtlasContent, E: NDArray[np.float32])
         file.attrs["patient_id"] = content.patient_id
         file.attrs["scene"] = content.scene.model_dump_json()
         file.attrs["groups"] = json.dumps([asdict(group) for group in content.groups])
+        file.attrs["materials"] = json.dumps({t.name.lower(): asdict(p) for t, p in content.materials.items()})
         write_mesh(file.create_group("mesh"), content.mesh)
         file["tissue"] = content.tissue
         file["entries"] = _to_table(content.entries)
@@ -147,6 +153,8 @@ class AtlasFile:
         Shape (M,), tissue class of each element.
     scene, entries, groups
         What was solved, the parameters of each column, and the columns whose weights share a sum limit.
+    materials
+        Properties of each tissue.
     software, created
         What wrote the file, and when (ISO 8601, UTC).
     """
@@ -163,6 +171,11 @@ class AtlasFile:
             WeightGroup(str(g["name"]), tuple(int(c) for c in g["columns"]), float(g["sum_limit"]))
             for g in json.loads(str(file.attrs["groups"]))
         )
+        # An atlas without this attribute was built with table 1, which nothing could change then.
+        self.materials: Mapping[Tissue, TissueProperties] = TABLE_1
+        if "materials" in file.attrs:
+            content = json.loads(str(file.attrs["materials"]))
+            self.materials = {Tissue[name.upper()]: TissueProperties(**values) for name, values in content.items()}
         self.entries = _from_table(file["entries"][()])
         self.mesh = read_mesh(file["mesh"])
         self.tissue: NDArray[np.uint8] = file["tissue"][()]
@@ -268,6 +281,7 @@ def _atlas_id(file: h5py.File, blocks: Sequence[str]) -> str:
         str(file.attrs["scene"]),
         str(file.attrs["groups"]),
         json.dumps([asdict(entry) for entry in entries]),
+        *([str(file.attrs["materials"])] if "materials" in file.attrs else []),
         *blocks,
     )
     return digest(str(file["mesh"].attrs["sha256"]), file["tissue"][()], *parts)

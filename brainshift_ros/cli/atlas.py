@@ -14,6 +14,8 @@ from brainshift_ros.atlas.build import BuildReport, build_atlas
 from brainshift_ros.atlas.file import open_atlas
 from brainshift_ros.atlas.scene import read_scene
 from brainshift_ros.errors import InputError
+from brainshift_ros.mechanics.materials import TABLE_1
+from brainshift_ros.mechanics.materials_file import read_materials
 from brainshift_ros.mechanics.solvers import SolverName
 from brainshift_ros.mesh.patient_file import read_patient
 from brainshift_ros.units import m_to_mm
@@ -23,6 +25,7 @@ from brainshift_ros.units import m_to_mm
 @click.argument("scene_path", metavar="[SCENE.yaml]", required=False, type=click.Path(path_type=Path))
 @click.option("--patient", "patient_path", type=click.Path(path_type=Path), help="Patient file, from `brainshift patient`.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Atlas file to write (HDF5).")
+@click.option("--materials", "materials_path", type=click.Path(path_type=Path), help="Tissue properties; default: table 1.")
 @click.option(
     "--solver",
     type=click.Choice(["auto", "pardiso", "scipy"]),
@@ -32,7 +35,12 @@ from brainshift_ros.units import m_to_mm
 )
 @click.option("--show", "shown", metavar="ATLAS", type=click.Path(path_type=Path), help="Describe an atlas and stop.")
 def command(
-    scene_path: Path | None, patient_path: Path | None, output: Path | None, solver: SolverName, shown: Path | None
+    scene_path: Path | None,
+    patient_path: Path | None,
+    output: Path | None,
+    materials_path: Path | None,
+    solver: SolverName,
+    shown: Path | None,
 ) -> None:
     """Solve what SCENE.yaml names on a patient's mesh and write the atlas.
 
@@ -45,6 +53,7 @@ def command(
     if scene_path is None or patient_path is None or output is None:
         raise click.UsageError("give SCENE.yaml, --patient and -o; or --show with an atlas")
     scene, patient = read_scene(scene_path), read_patient(patient_path)
+    materials = TABLE_1 if materials_path is None else read_materials(materials_path)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
     try:
         with Progress(*columns, console=console) as progress:
@@ -53,6 +62,7 @@ def command(
                 patient,
                 scene,
                 output,
+                materials=materials,
                 solver=solver,
                 progress=lambda stage, fraction: progress.update(task, description=stage, completed=fraction),
             )

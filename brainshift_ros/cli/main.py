@@ -14,7 +14,9 @@ from brainshift_ros.errors import InputError
 #: Subcommand -> module that holds it as a click command named `command`, and its line in `brainshift --help`.
 #: A module is imported only when its command runs, so that `--help` stays instant.
 COMMANDS: dict[str, tuple[str, str]] = {
-    "patient": ("brainshift_ros.cli.patient", "T1 MR and labels -> patient model (mesh, septa, tissue)."),
+    "segment": ("brainshift_ros.cli.segment", "T1 MR -> labels and septa, to be looked at and corrected."),
+    "compare": ("brainshift_ros.cli.compare", "Automatic labels and septa against a person's."),
+    "patient": ("brainshift_ros.cli.patient", "T1 MR -> patient model (segmentation, septa, mesh, tissue)."),
     "atlas": ("brainshift_ros.cli.atlas", "Scene and patient -> atlas of deformations."),
     "solve": ("brainshift_ros.cli.solve", "Atlas and sparse points -> displacement field."),
     "warp": ("brainshift_ros.cli.warp", "Displacement field and image -> warped image, ITK transform."),
@@ -22,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("brainshift_ros.cli.run", "Start the node graph, without `ros2`."),
     "replay": ("brainshift_ros.cli.replay", "Publish a recorded bag."),
     "record": ("brainshift_ros.cli.record", "Record the graph's topics into a bag."),
+    "experiment": ("brainshift_ros.cli.experiment", "A study of accuracy, speed or stability."),
     "demo": ("brainshift_ros.cli.demo", "The whole job once, on a real brain."),
 }
 

@@ -35,6 +35,7 @@ def draw_all(
     files: DemoFiles,
     patient: PatientModel,
     t1: Volume,
+    labels: Volume,
     case: RecordedCase,
     session: Session,
     field: DisplacementField,
@@ -60,7 +61,7 @@ def draw_all(
     mr_before_after(files.folder / "mr_before_after.png", t1, warped.volume, warped.inverse, tumor)
     displacement_map(files.folder / "displacement_mm.png", t1, forward, deformation.inside(grid), tumor)
     progress("mesh", 0.7)
-    patient_page(patient, t1, files.folder / "patient.png")
+    patient_page(patient, t1, labels, files.folder / "patient.png")
     _draw_boundary(files, case)
     progress("scan", 0.8)
     _draw_scans(files, patient, case, session)

@@ -102,7 +102,7 @@ def run_demo(scene: Scene, settings: DemoSettings, folder: Path, progress: Progr
         write_field(files.field, field)
         groups = evaluate_field(case, field)
     with stages.stage("pictures") as report:
-        image_checks = draw_all(files, patient, images.t1, case, session, field, report)
+        image_checks = draw_all(files, patient, images.t1, images.labels, case, session, field, report)
     stages.times_s["total"] = round(perf_counter() - begin, 3)
     stages.times_s["scan_to_field"] = round(session.scan_to_field_s, 3)
 

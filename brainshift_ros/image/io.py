@@ -1,4 +1,4 @@
-"""Read and write NIfTI images: the only place where voxels, millimetres and axis orders of files are interpreted."""
+"""Read an image, NIfTI or DICOM, and write NIfTI; here and in :mod:`.dicom` alone are files' axes and units interpreted."""
 
 from __future__ import annotations
 
@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.files import atomic_path, existing_file, writable_target
+from brainshift_ros.image.checks import check_affine, check_voxels, is_dicom
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.units import affine_m_to_mm, affine_mm_to_m
-
-#: Edge lengths of a voxel, in mm, beyond which the affine cannot be in millimetres.
-VOXEL_EDGE_RANGE_MM = (0.05, 20.0)
 
 #: What NIfTI files that hold header and voxels together are called.
 NIFTI_SUFFIXES = (".nii", ".nii.gz")
@@ -26,13 +24,15 @@ NIFTI_SUFFIXES = (".nii", ".nii.gz")
 _MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
 
 
-def read_volume(path: str | Path) -> Volume:
-    """Read a 3-D NIfTI image of any axis orientation and any affine, oblique ones included.
+def read_volume(path: str | Path, series: str | None = None) -> Volume:
+    """Read a 3-D image of any axis orientation and any affine, oblique ones included.
 
     Parameters
     ----------
     path
-        ``.nii`` or ``.nii.gz``.
+        ``.nii`` or ``.nii.gz``, or a folder with one DICOM series.
+    series
+        Number or unique id of the DICOM series, where the folder holds several.
 
     Returns
     -------
@@ -42,10 +42,18 @@ def read_volume(path: str | Path) -> Volume:
     Raises
     ------
     InputError
-        Missing, not a NIfTI, cut off, not 3-D, without a qform or sform, with a singular affine or an absurd voxel
-        size, with non-finite voxels, or zero everywhere.
+        Missing, not a NIfTI, cut off, not 3-D, without a qform or sform or with two that mirror each other, with a singular
+        affine or an absurd voxel size, with non-finite voxels, or zero everywhere; for a folder, what
+        :func:`~brainshift_ros.image.dicom.read_dicom_series` says.
     """
+    if Path(path).is_dir():
+        # Imported here: SimpleITK takes a while, and who reads NIfTI never needs it.
+        from brainshift_ros.image.dicom import read_dicom_series
+
+        return read_dicom_series(path, series)
     path = existing_file(path, "NIfTI image (.nii or .nii.gz)")
+    if is_dicom(path):
+        raise InputError(path, "is one DICOM image, not a volume", "give the folder that holds the series")
     try:
         image = nib.load(path)
     except (ImageFileError, HeaderDataError, OSError, EOFError, zlib.error, ValueError) as error:
@@ -55,15 +63,12 @@ def read_volume(path: str | Path) -> Volume:
     shape = image.shape
     while len(shape) > 3 and shape[-1] == 1:
         shape = shape[:-1]
-    if len(shape) != 3 or min(shape) < 1:
-        raise InputError(path, f"has shape {image.shape}, not three dimensions", "give one 3-D volume")
+    if len(shape) != 3 or min(shape) < 2:
+        what = "not three dimensions" if len(shape) != 3 else "a single slice"
+        raise InputError(path, f"has shape {image.shape}, {what}", "give one 3-D volume")
     T_patient_voxel = _affine_m(path, image)
     data = _voxels(path, image).reshape(shape)
-    if not np.isfinite(data).all():
-        count = int(np.count_nonzero(~np.isfinite(data)))
-        raise InputError(path, f"{count} of {data.size} voxels are not finite", "replace NaN and infinity by numbers")
-    if not data.any():
-        raise InputError(path, "every voxel is zero", "give an image with the head in it")
+    check_voxels(path, data)
     return Volume(data, T_patient_voxel)
 
 
@@ -105,16 +110,13 @@ def _affine_m(path: Path, image: nib.Nifti1Image) -> NDArray[np.float64]:
         problem = "has neither a qform nor an sform, so where its voxels lie in the head is unknown"
         raise InputError(path, problem, "export it again with its orientation, or set the sform")
     affine = np.array(image.affine, dtype=np.float64)
-    if not np.isfinite(affine).all():
-        raise InputError(path, "its affine is not finite", "repair the qform or sform")
     affine[:3] *= _MM_PER_UNIT.get(int(header["xyzt_units"]) & 7, 1.0)
-    edges = np.linalg.norm(affine[:3, :3], axis=0)
-    if edges.min() == 0.0 or abs(np.linalg.det(affine[:3, :3] / edges)) < 1e-3:
-        raise InputError(path, "its affine is singular: the voxel axes do not span space", "repair the qform or sform")
-    low, high = VOXEL_EDGE_RANGE_MM
-    if edges.min() < low or edges.max() > high:
-        problem = f"its voxels measure {' x '.join(f'{e:.4g}' for e in edges)} mm, which no head MR has"
-        raise InputError(path, problem, "the affine must be in millimetres; check the unit")
+    check_affine(path, affine, "repair the qform or sform")
+    if int(header["sform_code"]) > 0 and int(header["qform_code"]) > 0:
+        sform, qform = (np.linalg.det(form[:3, :3]) for form in (header.get_sform(), header.get_qform()))
+        if sform * qform < 0.0:
+            problem = "its qform and sform mirror each other, so left and right are unknown"
+            raise InputError(path, problem, "find out which is right and copy it to the other")
     return affine_mm_to_m(affine)
 
 

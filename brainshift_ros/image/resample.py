@@ -13,6 +13,9 @@ from brainshift_ros.image.volume import Volume
 
 _ORDER = {"nearest": 0, "linear": 1}
 
+# Zero beyond the voxels, whose outermost half belongs to the image: "constant" would drop a whole face of it by round-off.
+_OUTSIDE = "grid-constant"
+
 
 def resample(volume: Volume, grid: Volume, interpolation: Literal["nearest", "linear"]) -> Volume:
     """Sample `volume` at the voxel centres of `grid`.
@@ -43,7 +46,7 @@ def resample(volume: Volume, grid: Volume, interpolation: Literal["nearest", "li
         output_shape=grid.shape,
         output=dtype,
         order=_ORDER[interpolation],
-        mode="constant",
+        mode=_OUTSIDE,
     )
     return Volume(data, grid.T_patient_voxel)
 
@@ -68,5 +71,5 @@ def sample(volume: Volume, points: ArrayLike, interpolation: Literal["nearest", 
     points = np.asarray(points, dtype=np.float64)
     voxels = transform_points(np.linalg.inv(volume.T_patient_voxel), points.reshape(-1, 3)).T
     dtype = volume.data.dtype if interpolation == "nearest" else np.dtype(np.float64)
-    values = ndimage.map_coordinates(volume.data, voxels, output=dtype, order=_ORDER[interpolation], mode="constant")
+    values = ndimage.map_coordinates(volume.data, voxels, output=dtype, order=_ORDER[interpolation], mode=_OUTSIDE)
     return values.reshape(points.shape[:-1])

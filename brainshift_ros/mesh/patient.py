@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.segmentation.template_map import TemplateMap
 
 
 class Tissue(IntEnum):
@@ -51,6 +52,8 @@ class PatientModel:
         What a person should know before trusting the model.
     patient_id
         Hex SHA-256 over the model's arrays; atlases and fields carry it, so that foreign ones are recognised.
+    template_map
+        The registration of the template that labels or septa came from; None if both came from a person.
     """
 
     mesh: TetMesh
@@ -60,3 +63,4 @@ class PatientModel:
     quality: Mapping[str, float]
     warnings: tuple[str, ...]
     patient_id: str
+    template_map: TemplateMap | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import h5py
@@ -13,6 +14,7 @@ from brainshift_ros.h5 import digest, digest_of_mesh, open_checked, read_mesh, w
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
 from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.segmentation.template_map import TemplateMap
 
 KIND, VERSION = "patient", 1
 _REMEDY = "the file was changed or damaged; make it again with `brainshift patient`"
@@ -40,6 +42,11 @@ def write_patient(path: str | Path, patient: PatientModel) -> None:
         quality = file.create_group("quality")
         for name, value in patient.quality.items():
             quality.attrs[name] = value
+        if patient.template_map is not None:
+            group = file.create_group("template_map")
+            for field in fields(TemplateMap):
+                data = getattr(patient.template_map, field.name)
+                group.create_dataset(field.name, data=data, compression="gzip" if data.ndim > 2 else None)
         file.attrs.create("warnings", list(patient.warnings), dtype=h5py.string_dtype())
 
 
@@ -63,6 +70,7 @@ def read_patient(path: str | Path) -> PatientModel:
             )
             quality = {name: float(value) for name, value in file["quality"].attrs.items()}
             warnings = tuple(str(text) for text in file.attrs["warnings"])
+            template_map = _read_template_map(file)
             patient_id = str(file.attrs["patient_id"])
         except InputError:
             raise
@@ -70,4 +78,11 @@ def read_patient(path: str | Path) -> PatientModel:
             raise InputError(path, f"lacks parts of a patient model, or they cannot be read ({error})", _REMEDY) from error
     if patient_digest(mesh, tissue, cortex, image) != patient_id:
         raise InputError(path, "its content does not match its patient id", _REMEDY)
-    return PatientModel(mesh, tissue, cortex, image, quality, warnings, patient_id)
+    return PatientModel(mesh, tissue, cortex, image, quality, warnings, patient_id, template_map)
+
+
+def _read_template_map(file: h5py.File) -> TemplateMap | None:
+    if "template_map" not in file:
+        return None
+    group = file["template_map"]
+    return TemplateMap(**{field.name: group[field.name][()] for field in fields(TemplateMap)})

@@ -17,13 +17,18 @@ from brainshift_ros.units import m3_to_ml, m_to_mm
 LIMITS: Mapping[str, tuple[float, float]] = {
     "inverted": (0.0, 0.0),
     "components": (1.0, 1.0),
-    "dihedral_min_deg": (5.0, 71.0),
-    "volume_error_percent": (0.0, 2.0),
-    "tumor_volume_error_percent": (0.0, 5.0),
+    "dihedral_min_deg": (10.0, 71.0),
+    "volume_error_percent": (0.0, 1.0),
+    "tumor_volume_error_percent": (0.0, 3.0),
+    "falx_area_error_percent": (0.0, 5.0),
+    "tentorium_area_error_percent": (0.0, 5.0),
+    # The mesher sometimes gives up following a part of a sheet; another attempt follows it.
+    "falx_stray_percent": (0.0, 5.0),
+    "tentorium_stray_percent": (0.0, 5.0),
 }
 
 
-def dihedral_angles_deg(nodes: NDArray[np.float64], elements: NDArray[np.int32]) -> NDArray[np.float64]:
+def dihedral_angles_deg(nodes: NDArray[np.float64], elements: NDArray[np.integer]) -> NDArray[np.float64]:
     """Six dihedral angles of each element, shape (M, 6), degrees; 70.5 in a regular tetrahedron."""
     x = nodes[elements]
     # Normals of the four faces are the gradients of the barycentric coordinates.
@@ -57,7 +62,7 @@ def element_quality(mesh: TetMesh) -> dict[str, float]:
 
 def relative_error_percent(value: float, reference: float) -> float:
     """Absolute difference in per cent of the reference."""
-    return 100.0 * abs(value - reference) / reference
+    return float(100.0 * abs(value - reference) / reference)
 
 
 def faults(quality: Mapping[str, float]) -> tuple[str, ...]:

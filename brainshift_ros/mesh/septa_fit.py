@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from brainshift_ros.errors import InputError
-from brainshift_ros.mesh.queries import inside
+from brainshift_ros.mesh.queries import closest_points, inside
 from brainshift_ros.mesh.sheets import Septum
 from brainshift_ros.mesh.split import sheet_surfaces
 from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.surfacing import face_areas
+from brainshift_ros.units import m_to_mm
 
 #: Share of a sheet's area inside the brain. On the template it is 0.83 (falx) and 0.92 (tentorium); with landmarks in LPS
 #: 0.56 and 0.35. Wide fissures that are not labelled as brain lower it, so only very little is refused.
 _LEAST_INSIDE, _USUAL_INSIDE = 0.1, 0.6
+
+#: Share of an attached edge that may end inside the brain without a word: the petrous apex does.
+_ENDING_INSIDE = 0.1
 
 
 def check_septa(septa: Sequence[Septum], brain: Surface) -> tuple[str, ...]:
@@ -41,4 +47,12 @@ def check_septa(septa: Sequence[Septum], brain: Surface) -> tuple[str, ...]:
             raise InputError("septa", problem, "give landmarks of this patient, in mm, RAS")
         if share < _USUAL_INSIDE:
             warnings.append(f"only {share:.0%} of the {name} lies in the brain: look at it on the MR")
+        edge = np.vstack([septum.surface.vertices[septum.attached] for septum in septa if septum.name == name])
+        ends = edge[inside(brain, edge)] if len(edge) else edge
+        if len(ends) > _ENDING_INSIDE * len(edge):
+            gap_mm = float(m_to_mm(closest_points(brain, ends).distance.max()))
+            warnings.append(
+                f"{len(ends) / len(edge):.0%} of the {name}'s attached edge ends inside the brain, up to {gap_mm:.1f} mm "
+                "from its surface: a gap is left there"
+            )
     return tuple(warnings)

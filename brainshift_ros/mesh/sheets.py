@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -14,14 +13,14 @@ from scipy.spatial import Delaunay
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import tangent_frame
-from brainshift_ros.image.landmarks import Polyline, SeptaLandmarks
+from brainshift_ros.image.landmarks import SeptaLandmarks
 from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.units import mm_to_m
 
 SeptumName = Literal["falx", "tentorium"]
 
-#: No falx or tentorium is smaller than this from end to end.
-_SMALLEST_MM = 30.0
+#: Falx and tentorium are larger, and smaller, than this from end to end.
+_SMALLEST_MM, _LARGEST_MM = 30.0, 400.0
 
 
 @dataclass(frozen=True)
@@ -35,10 +34,14 @@ class Septum:
     surface
         Open triangle sheet that reaches beyond the brain where it is attached to the skull. The falx's normals point
         right, the tentorium's up.
+    attached
+        Shape (n,), vertices along the edge that is attached to the skull, in order from the torcula forward; empty where
+        that is not known.
     """
 
     name: SeptumName
     surface: Surface
+    attached: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, dtype=np.int32))
 
 
 def septa_spacing_mm(nodes: int) -> float:
@@ -63,13 +66,47 @@ def septa_from_landmarks(landmarks: SeptaLandmarks, spacing_mm: float = 5.0) -> 
     InputError
         A sheet is far too small to be one, or its landmarks span none.
     """
-    sinus = _polyline(landmarks.straight_sinus, spacing_mm)
-    falx_edge = _polyline([sinus[-1], *landmarks.falx.outer_edge, *landmarks.falx.free_edge, sinus[0]], spacing_mm)
-    septa = [Septum("falx", sheet(np.vstack([sinus, falx_edge[1:-1]]), (), (1.0, 0.0, 0.0), spacing_mm))]
+    sinus = resampled(landmarks.straight_sinus, spacing_mm)
+    falx = landmarks.falx
+    septa = [septum_inside("falx", sinus, falx.outer_edge, falx.free_edge, (), spacing_mm)]
     for side in (landmarks.tentorium.left, landmarks.tentorium.right_side):
-        edge = _polyline([sinus[-1], *side.attachment, *side.free_edge, sinus[0]], spacing_mm)
-        septa.append(Septum("tentorium", sheet(np.vstack([sinus, edge[1:-1]]), side.surface, (0.0, 0.0, 1.0), spacing_mm)))
+        septa.append(septum_inside("tentorium", sinus, side.attachment, side.free_edge, side.surface, spacing_mm))
     return tuple(septa)
+
+
+def septum_inside(
+    name: SeptumName,
+    sinus_mm: NDArray[np.float64],
+    attached_mm: ArrayLike,
+    free_mm: ArrayLike,
+    interior_mm: ArrayLike,
+    spacing_mm: float,
+    normal: ArrayLike | None = None,
+) -> Septum:
+    """Span one sheet between the straight sinus, its edge on the skull and its free edge.
+
+    Parameters
+    ----------
+    name
+        Falx or tentorium.
+    sinus_mm
+        Shape (n, 3), mm, from the apex of the tentorial notch back to the torcula; its points become vertices as they are.
+    attached_mm, free_mm
+        Polylines of shape (m, 3), mm: from beside the torcula along the skull, and from there back to beside the apex.
+    interior_mm
+        Points of the sheet, shape (k, 3), mm; may be empty.
+    spacing_mm
+        Distance between neighbouring vertices.
+    normal
+        Side that the faces' normals point to; by default right for the falx and up for the tentorium.
+    """
+    if normal is None:
+        normal = (1.0, 0.0, 0.0) if name == "falx" else (0.0, 0.0, 1.0)
+    attached = resampled(np.vstack([sinus_mm[-1], attached_mm]), spacing_mm)
+    free = resampled(np.vstack([attached[-1], free_mm, sinus_mm[0]]), spacing_mm)
+    surface = sheet(np.vstack([sinus_mm, attached[1:], free[1:-1]]), interior_mm, normal, spacing_mm)
+    first = len(sinus_mm) - 1
+    return Septum(name, surface, np.arange(first, first + len(attached), dtype=np.int32))
 
 
 def sheet(ring_mm: ArrayLike, interior_mm: ArrayLike, normal: ArrayLike, spacing_mm: float) -> Surface:
@@ -93,12 +130,12 @@ def sheet(ring_mm: ArrayLike, interior_mm: ArrayLike, normal: ArrayLike, spacing
     Raises
     ------
     InputError
-        The edge is far too small for a septum, or the points span no sheet.
+        The edge is far too small or too large for a septum, crosses itself, or the points span no sheet.
     """
     ring = np.asarray(ring_mm, dtype=np.float64)
     interior = np.asarray(interior_mm, dtype=np.float64).reshape(-1, 3)
     extent = float(np.linalg.norm(np.ptp(ring, axis=0)))
-    if extent < _SMALLEST_MM:
+    if not _SMALLEST_MM < extent < _LARGEST_MM:
         problem = f"a sheet measures {extent:.3g} mm from end to end"
         raise InputError("septa landmarks", problem, "give falx and tentorium of a human head, in mm")
     R = tangent_frame(normal)
@@ -106,6 +143,11 @@ def sheet(ring_mm: ArrayLike, interior_mm: ArrayLike, normal: ArrayLike, spacing
     # The spline's matrix would be singular, which its solver does not always notice.
     if len(np.unique(known[:, :2].round(3), axis=0)) < len(known):
         raise InputError("septa landmarks", "two points of a sheet lie above each other", "remove repeated points")
+    crossing = _self_crossing(ring_local[:, :2])
+    if crossing is not None:
+        place = ", ".join(f"{value:.0f}" for value in ring[crossing])
+        problem = f"a sheet's periphery crosses itself near ({place}) mm"
+        raise InputError("septa landmarks", problem, "give its points in order, once around the sheet")
     height = RBFInterpolator(known[:, :2], known[:, 2], kernel="thin_plate_spline")
     polygon = Polygon(ring_local[:, :2])
     grid = _triangular_grid(ring_local[:, :2], spacing_mm)
@@ -116,6 +158,20 @@ def sheet(ring_mm: ArrayLike, interior_mm: ArrayLike, normal: ArrayLike, spacing
     faces = Delaunay(local[:, :2]).simplices
     faces = faces[polygon.contains_points(local[faces, :2].mean(axis=1))]
     return Surface(mm_to_m(local @ R), _turned_up(local, faces))
+
+
+def _self_crossing(ring: NDArray[np.float64]) -> int | None:
+    """Index of a segment of a closed polygon, shape (n, 2), that another crosses; None where the polygon is simple."""
+    start, end = ring, np.roll(ring, -1, axis=0)
+
+    def turn(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
+        u, v = b - a, c - a
+        return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+    p, q, r, s = start[:, None], end[:, None], start[None], end[None]
+    crosses = (turn(p, q, r) * turn(p, q, s) < 0.0) & (turn(r, s, p) * turn(r, s, q) < 0.0)
+    found = np.flatnonzero(crosses.any(axis=1))
+    return int(found[0]) if len(found) else None
 
 
 def _turned_up(local: NDArray[np.float64], faces: NDArray) -> NDArray[np.int32]:
@@ -134,9 +190,9 @@ def _triangular_grid(points: NDArray[np.float64], spacing: float) -> NDArray[np.
     return np.column_stack([x.ravel(), y.ravel()])
 
 
-def _polyline(points: Polyline | Sequence[ArrayLike], spacing: float) -> NDArray[np.float64]:
-    """Resample a polyline at about equal steps; its ends stay."""
-    vertices = np.asarray(points, dtype=np.float64)
+def resampled(points_mm: ArrayLike, spacing_mm: float) -> NDArray[np.float64]:
+    """Resample a polyline of shape (n, 3) at about equal steps; its ends stay."""
+    vertices = np.asarray(points_mm, dtype=np.float64)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(vertices, axis=0), axis=1))])
-    steps = np.linspace(0.0, arc[-1], max(2, round(arc[-1] / spacing) + 1))
+    steps = np.linspace(0.0, arc[-1], max(2, round(arc[-1] / spacing_mm) + 1))
     return np.column_stack([np.interp(steps, arc, vertices[:, k]) for k in range(3)])

@@ -23,10 +23,13 @@ class SideOfSheet:
         Shape (n,), metres, along the sheet's normal; its sign is the side.
     overshoot
         Shape (n,), metres by which a point lies past the sheet's edge; zero for points beside the sheet.
+    closest
+        Shape (n, 3), metres, the sheet's point closest to each.
     """
 
     height: NDArray[np.float64]
     overshoot: NDArray[np.float64]
+    closest: NDArray[np.float64]
 
 
 def side_of_sheet(sheet: Surface, points: NDArray[np.float64]) -> SideOfSheet:
@@ -45,7 +48,7 @@ def side_of_sheet(sheet: Surface, points: NDArray[np.float64]) -> SideOfSheet:
     # the closest point is on the sheet's edge if every corner that carries weight is
     past = np.all(at_edge | (weights < 1e-3), axis=1)
     overshoot = np.where(past, np.sqrt(np.maximum(np.einsum("nk,nk->n", offset, offset) - height**2, 0.0)), 0.0)
-    return SideOfSheet(height, overshoot)
+    return SideOfSheet(height, overshoot, found.position)
 
 
 def merged(sheets: list[Surface]) -> Surface:

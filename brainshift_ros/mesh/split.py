@@ -8,13 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brainshift_ros.mesh.facets import FaceTable, components, face_table
+from brainshift_ros.mesh.facets import FaceTable, components, face_table, facet_areas
+from brainshift_ros.mesh.queries import closest_points
 from brainshift_ros.mesh.sheets import Septum
 from brainshift_ros.mesh.side import merged, side_of_sheet
 from brainshift_ros.mesh.surface import Surface
 
 #: How far past a sheet's edge the centre of a mesh face may lie and still be cut, metres.
 EDGE_TOLERANCE_M = 0.001
+
+#: The same where falx meets tentorium: meshed, the two may meet that far from the straight sinus.
+JUNCTION_REACH_M = 0.005
+
+#: How far from a sheet the centre of an element may lie and still be counted to the other side, metres.
+SHEET_TOLERANCE_M = 0.001
+
+#: Pockets hold less than this share of all elements; turning one rarely leaves another, never as many as this in a row.
+_LARGEST_POCKET, _POCKET_PASSES = 0.02, 20
 
 
 @dataclass(frozen=True)
@@ -46,7 +56,12 @@ def sheet_surfaces(septa: Sequence[Septum]) -> dict[str, Surface]:
     return {name: merged([s.surface for s in septa if s.name == name]) for name in names}
 
 
-def split_along_septa(nodes: NDArray[np.float64], elements: NDArray[np.int32], septa: Sequence[Septum]) -> SplitMesh:
+def split_along_septa(
+    nodes: NDArray[np.float64],
+    elements: NDArray[np.int32],
+    septa: Sequence[Septum],
+    uncut: NDArray[np.bool_] | None = None,
+) -> SplitMesh:
     """Split a mesh whose faces follow the septa.
 
     A face is cut where its two elements lie on opposite sides of a sheet and its centre lies beside the sheet. Such a
@@ -62,9 +77,13 @@ def split_along_septa(nodes: NDArray[np.float64], elements: NDArray[np.int32], s
         Shape (M, 4).
     septa
         Sheets that reach beyond the mesh where they are attached.
+    uncut
+        Shape (M,), elements that stay joined to each other across a sheet: tumour that grew through it.
     """
     table = face_table(elements)
-    cut_by = _cut_faces(nodes, elements, table, sheet_surfaces(septa))
+    whole = np.zeros(len(elements), dtype=bool) if uncut is None else uncut
+    may_be_cut = ~(whole[table.owners[:, 0]] & whole[table.owners[:, 1]])
+    cut_by = _cut_faces(nodes, elements, table, sheet_surfaces(septa), may_be_cut)
     every_cut = np.concatenate([np.empty(0, dtype=np.int64), *(cut.faces for cut in cut_by.values())])
     if len(every_cut) == 0:
         empty = np.empty((0, 3), dtype=np.int32)
@@ -80,7 +99,7 @@ def split_along_septa(nodes: NDArray[np.float64], elements: NDArray[np.int32], s
         # A lone facet at a sheet's tip, with all its nodes on the free edge, parts nothing.
         parted = np.any(np.sort(below, axis=1) != np.sort(above, axis=1), axis=1)
         facets[name] = np.vstack([below[parted], above[parted]])
-        rims[name] = _rim(below[parted], above[parted])
+        rims[name] = rim_nodes(below[parted], above[parted])
     return SplitMesh(new_nodes, new_elements, facets, rims)
 
 
@@ -94,37 +113,81 @@ class _Cut:
 
 
 def _cut_faces(
-    nodes: NDArray[np.float64], elements: NDArray[np.int32], table: FaceTable, sheets: Mapping[str, Surface]
+    nodes: NDArray[np.float64],
+    elements: NDArray[np.int32],
+    table: FaceTable,
+    sheets: Mapping[str, Surface],
+    may_be_cut: NDArray[np.bool_],
 ) -> dict[str, _Cut]:
+    """Choose the faces that each sheet cuts among those, shape (F,) of the interior ones, that may be."""
     centres = nodes[elements].mean(axis=1)
     face_centres = nodes[table.interior].mean(axis=1)
-    cut_by: dict[str, _Cut] = {}
-    taken = np.zeros(len(table.interior), dtype=bool)
-    for name, surface in sheets.items():
-        side = side_of_sheet(surface, centres).height >= 0.0
-        beside = side_of_sheet(surface, face_centres).overshoot <= EDGE_TOLERANCE_M
-        side = _without_pockets(side, beside, table)
+    areas = facet_areas(nodes, table.interior)
+    cuts: dict[str, _Cut] = {}
+    open_, parted = may_be_cut.copy(), np.zeros(len(table.interior), dtype=bool)
+    # The falx stands on the tentorium: it goes down to it, takes none of its faces, and none between elements below it.
+    roof: Surface | None = None
+    for name in sorted(sheets, key=("tentorium", "falx").index):
+        located = side_of_sheet(sheets[name], centres)
+        beside = open_ & _beside(sheets[name], roof, face_centres)
+        side = _smoothed(located.height, beside, areas, table)
+        side = _without_pockets(side, beside, parted, table)
         first, second = side[table.owners].T
-        faces = np.flatnonzero((first != second) & beside & ~taken)
+        faces = np.flatnonzero((first != second) & beside)
         one, two = table.owners[faces].T
-        cut_by[name] = _Cut(faces, np.where(side[one], two, one), np.where(side[one], one, two))
-        taken[faces] = True
-    return cut_by
+        cuts[name] = _Cut(faces, np.where(side[one], two, one), np.where(side[one], one, two))
+        roof, below = sheets[name], ~side & (located.overshoot == 0.0)
+        parted[faces] = True
+        open_ &= ~(parted | below[table.owners].all(axis=1))
+    return {name: cuts[name] for name in sheets}
 
 
-def _without_pockets(side: NDArray[np.bool_], beside: NDArray[np.bool_], table: FaceTable) -> NDArray[np.bool_]:
-    """Turn elements to the other side that a cut would isolate from all the rest."""
+def _beside(sheet: Surface, roof: Surface | None, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which points, shape (n, 3), lie beside a sheet, or just past its edge where it stands on a roof."""
+    located = side_of_sheet(sheet, points)
+    beside = located.overshoot <= EDGE_TOLERANCE_M
+    if roof is not None:
+        past = np.flatnonzero(~beside & (located.overshoot <= JUNCTION_REACH_M))
+        on_roof = closest_points(roof, located.closest[past]).distance < EDGE_TOLERANCE_M
+        beside[past] = on_roof & (side_of_sheet(roof, points[past]).overshoot == 0.0)
+    return beside
+
+
+def _smoothed(
+    height: NDArray[np.float64], beside: NDArray[np.bool_], areas: NDArray[np.float64], table: FaceTable
+) -> NDArray[np.bool_]:
+    """Side of each element: that of its centre, but for elements right at the sheet, which take the side that cuts less.
+
+    The mesher leaves elements whose faces straddle the sheet; without this the cut would run around each, and its rims
+    would have single facets for teeth.
+    """
+    side = height >= 0.0
+    owners, areas = table.owners[beside], areas[beside]
+    for _ in range(10):
+        cut = side[owners[:, 0]] != side[owners[:, 1]]
+        gain = np.bincount(owners.ravel(), np.repeat(np.where(cut, areas, -areas), 2), minlength=len(side))
+        straddles = np.bincount(owners[cut].ravel(), minlength=len(side)) > 1
+        turn = straddles & (gain > 0.0) & (np.abs(height) < SHEET_TOLERANCE_M)
+        if not turn.any():
+            break
+        side = side ^ turn
+    return side
+
+
+def _without_pockets(
+    side: NDArray[np.bool_], beside: NDArray[np.bool_], parted: NDArray[np.bool_], table: FaceTable
+) -> NDArray[np.bool_]:
+    """Turn elements to the other side that a cut, with the faces parted before, would isolate from all the rest."""
     side = side.copy()
-    while True:
+    for _ in range(_POCKET_PASSES):
         cut = (side[table.owners[:, 0]] != side[table.owners[:, 1]]) & beside
-        part = components(len(side), table.owners[~cut])
+        part = components(len(side), table.owners[~(cut | parted)])
         pocket = part != np.argmax(np.bincount(part))
-        if not pocket.any():
-            return side
         # A pocket that is nearly half of the mesh is no pocket: the sheet parts the mesh, which the gate then refuses.
-        if np.count_nonzero(pocket) > 0.02 * len(side):
-            return side
+        if not pocket.any() or np.count_nonzero(pocket) > _LARGEST_POCKET * len(side):
+            break
         side[pocket] = ~side[pocket]
+    return side
 
 
 def _double_nodes(
@@ -168,7 +231,7 @@ def _turned(faces: NDArray[np.int32], turn: NDArray[np.bool_]) -> NDArray[np.int
     return np.where(turn[:, None], faces[:, ::-1], faces)
 
 
-def _rim(below: NDArray[np.int32], above: NDArray[np.int32]) -> NDArray[np.int32]:
+def rim_nodes(below: NDArray[np.int32], above: NDArray[np.int32]) -> NDArray[np.int32]:
     """Nodes of the edges that both sides of a sheet share: there it ends inside the tissue.
 
     Where it ends on the skull or on another sheet, each side has its own copies.

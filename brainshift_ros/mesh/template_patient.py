@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from brainshift_ros.image.template import template_labels, template_landmarks, template_t1
 from brainshift_ros.image.tumor import TumorShape, draw_tumor
 from brainshift_ros.image.volume import Volume
-from brainshift_ros.mesh.sheets import Septum, septa_from_landmarks
+from brainshift_ros.mesh.septa_template import septa_from_template
+from brainshift_ros.mesh.sheets import Septum
 
 
 @dataclass(frozen=True)
@@ -39,4 +40,4 @@ def template_patient_images(tumor: TumorShape | None = None, septa_spacing_mm: f
     """
     landmarks = template_landmarks()
     t1, labels = draw_tumor(template_t1(), template_labels(landmarks), tumor)
-    return TemplateImages(t1, labels, septa_from_landmarks(landmarks.septa, septa_spacing_mm))
+    return TemplateImages(t1, labels, septa_from_template(lambda points: points, septa_spacing_mm))

@@ -39,6 +39,10 @@ class TetMesh:
     @property
     def volumes(self) -> NDArray[np.float64]:
         """Signed volume of each element, m^3."""
-        x = self.nodes[self.elements]
-        edges = x[:, 1:] - x[:, :1]
-        return np.linalg.det(edges) / 6.0
+        return tetrahedron_volumes(self.nodes, self.elements)
+
+
+def tetrahedron_volumes(nodes: NDArray[np.float64], elements: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Signed volume of elements of shape (M, 4), m^3."""
+    x = nodes[elements]
+    return np.linalg.det(x[:, 1:] - x[:, :1]) / 6.0

@@ -17,7 +17,7 @@ def main(given: str, made: str) -> None:
             edge_length_abs=float(arrays["edge_length_abs"]),
             epsilon=float(arrays["epsilon"]),
             stop_energy=float(arrays["stop_energy"]),
-            num_threads=1,
+            num_threads=int(arrays["threads"]),
             # The winding number that decides inside or outside means nothing beside open sheets.
             disable_filtering=True,
             bg_vertices=arrays["bg_vertices"],

@@ -20,7 +20,7 @@ from brainshift_ros.graph import Topic
 from brainshift_ros.nodes.health import Health, Level
 from brainshift_ros.nodes.messages import message_class, to_message
 from brainshift_ros.nodes.qos import PROFILES
-from brainshift_ros.nodes.stopping import leave, ros_until_stopped, withdraw
+from brainshift_ros.nodes.stopping import leave, ros_until_stopped
 from brainshift_ros.nodes.worker import Worker
 from brainshift_ros.wire.plain import Plain
 
@@ -183,5 +183,4 @@ def spin(factory: Callable[[], BrainshiftNode]) -> None:
         executor.spin_once()  # the heartbeat ends it after 0.4 s at the latest
     node.shut_down()
     executor.shutdown()
-    withdraw(node)
-    leave(0)
+    leave(0, node)

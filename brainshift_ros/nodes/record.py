@@ -16,7 +16,7 @@ from brainshift_ros.bags import BagWriter
 from brainshift_ros.graph import Topic
 from brainshift_ros.nodes.messages import message_class
 from brainshift_ros.nodes.qos import PROFILES
-from brainshift_ros.nodes.stopping import ros_until_stopped, withdraw
+from brainshift_ros.nodes.stopping import leave, ros_until_stopped
 from brainshift_ros.nodes.tool import run_tool
 
 POLL_S = 0.1
@@ -27,13 +27,13 @@ class Recorder(Node):
 
     def __init__(self, bag: BagWriter, topics: list[Topic]) -> None:
         super().__init__("record")
-        self._bag = bag
+        self.bag, self.topics = bag, topics
         for topic in topics:
             self._subscribe(topic)
 
     def _subscribe(self, topic: Topic) -> None:
         def on_bytes(cdr: bytes) -> None:
-            self._bag.add_raw(topic, self.get_clock().now().nanoseconds, cdr)
+            self.bag.add_raw(topic, self.get_clock().now().nanoseconds, cdr)
 
         self.create_subscription(message_class(topic.type), topic.name, on_bytes, PROFILES[topic.qos], raw=True)
 
@@ -55,30 +55,28 @@ def command(out: Path, names: tuple[str, ...], goals: tuple[str, ...], timeout: 
     topics += [topic for topic in graph.topics_named(list(wanted)) if topic not in topics]
     stop = ros_until_stopped()
     with BagWriter(out, replace=replace) as bag:
-        met = _record(bag, topics, wanted, timeout, stop)
+        node = Recorder(bag, topics)
+        met = _record(node, wanted, timeout, stop)
     print(f"recorded {sum(bag.counts.values())} messages into {out}", flush=True)
     if not met:
         lacking = ", ".join(f"{name} ({bag.counts.get(name, 0)} of {count})" for name, count in wanted.items())
         print(f"stopped after {timeout} s without {lacking}", file=sys.stderr)
-        sys.exit(3)
+    leave(0 if met else 3, node)
 
 
-def _record(bag: BagWriter, topics: list[Topic], wanted: dict[str, int], timeout: float | None, stop: threading.Event) -> bool:
+def _record(node: Recorder, wanted: dict[str, int], timeout: float | None, stop: threading.Event) -> bool:
     """Record until told to stop; False if the time was up before the goals were met."""
     deadline = None if timeout is None else time.monotonic() + timeout
-    node = Recorder(bag, topics)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    print(f"recording {len(topics)} topics", flush=True)
-    met = not wanted
+    print(f"recording {len(node.topics)} topics", flush=True)
     while not stop.is_set():
-        met = all(bag.counts.get(name, 0) >= count for name, count in wanted.items())
-        if (wanted and met) or (deadline is not None and time.monotonic() > deadline):
-            break
+        if wanted and all(node.bag.counts.get(name, 0) >= count for name, count in wanted.items()):
+            return True
+        if deadline is not None and time.monotonic() > deadline:
+            return not wanted
         executor.spin_once(timeout_sec=POLL_S)
-    executor.shutdown()
-    withdraw(node)
-    return met or stop.is_set()
+    return True
 
 
 def _goal(text: str) -> tuple[Topic, int]:

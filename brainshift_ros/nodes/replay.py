@@ -19,7 +19,7 @@ from brainshift_ros.bags import Recorded, read_bag
 from brainshift_ros.errors import InputError
 from brainshift_ros.nodes.messages import message_class
 from brainshift_ros.nodes.qos import PROFILES
-from brainshift_ros.nodes.stopping import ros_until_stopped, withdraw
+from brainshift_ros.nodes.stopping import leave, ros_until_stopped
 from brainshift_ros.nodes.tool import run_tool
 from brainshift_ros.wire.plain import NS_PER_S
 
@@ -89,7 +89,7 @@ def command(bag: Path, rate: float, names: tuple[str, ...], subscribers: int, wa
     publish_bag(node, recorded, rate=rate, subscribers=subscribers, wait_s=wait_s, stop=stop)
     if stay:
         stop.wait()
-    withdraw(node)
+    leave(0, node)
 
 
 def main() -> None:

@@ -16,6 +16,11 @@ import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from brainshift_ros.nodes.deadline import exit_after
+
+#: How long ROS may take to go; it needs a few tenths of a second.
+TEARDOWN_LIMIT_S = 1.5
+
 
 def ros_until_stopped() -> threading.Event:
     """Initialise rclpy and return an event that SIGINT and SIGTERM set."""
@@ -30,23 +35,18 @@ def ros_until_stopped() -> threading.Event:
     return stop
 
 
-def withdraw(node: Node) -> None:
-    """Take a node's endpoints out of the graph, so that nobody waits for them; the last thing before :func:`leave`."""
-    for publisher in list(node.publishers):
-        node.destroy_publisher(publisher)
-    for subscription in list(node.subscriptions):
-        node.destroy_subscription(subscription)
-    for service in list(node.services):
-        node.destroy_service(service)
+def leave(status: int, node: Node | None = None) -> NoReturn:
+    """End the process: take the node out of the graph, so that nobody waits for it, then exit with `status` in any case.
 
-
-def leave(status: int) -> NoReturn:
-    """End the process without taking ROS down.
-
-    When several processes end at the same moment, Fast DDS may wait for ever in the destruction of its participant, for a
-    discovery callback that waits for the same lock, with Python's global lock held. Nothing is left to be saved by then.
-    A thread in native code would also be torn down under the interpreter's feet.
+    When several processes end at the same moment, Fast DDS 3.2 may wait for ever in the destruction of its participant, for
+    a discovery callback that waits for the same lock, with Python's global lock held. Nothing is left to be saved by then.
+    Not destroying it at all would leave its 64 MB of shared memory behind.
     """
     sys.stdout.flush()
     sys.stderr.flush()
+    exit_after(TEARDOWN_LIMIT_S, status)
+    if node is not None:
+        node.destroy_node()
+    rclpy.try_shutdown()
+    # A worker thread in native code would be torn down under the interpreter's feet.
     os._exit(status)

@@ -11,11 +11,9 @@ from brainshift_ros.nodes.stopping import leave
 
 
 def run_tool(command: click.Command, name: str) -> None:
-    """Run a command and end the process; bad input ends it with one line on stderr and exit status 2."""
+    """Run a command; bad input ends the process with one line on stderr and exit status 2."""
     try:
         command(prog_name=f"brainshift {name}")
     except InputError as error:
         print(f"brainshift: {error}", file=sys.stderr)
         leave(2)
-    except SystemExit as end:  # how click ends a command, with success as well
-        leave(end.code if isinstance(end.code, int) else 0)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import fill
 from typing import cast
 
 import numpy as np
 import pyvista as pv
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -21,7 +24,7 @@ from brainshift_ros.geometry import unit
 from brainshift_ros.image.resample import sample
 from brainshift_ros.image.volume import Region, Volume
 from brainshift_ros.mesh.patient import PatientModel, Tissue
-from brainshift_ros.mesh.quality import dihedral_angles_deg
+from brainshift_ros.mesh.quality import LIMITS, dihedral_angles_deg
 from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.surfacing import polydata
 from brainshift_ros.units import m_to_mm, mm_to_m
@@ -35,10 +38,13 @@ REGION_COLOURS = {
     Region.BRAINSTEM: "#ffd23f",
     Region.TUMOR: "#ff4d4d",
 }
+#: A slice in the falx itself would show nothing but the falx.
+BESIDE_FALX_M = 0.004
+
 _PLANES = {0: ("sagittal", "y", "z"), 1: ("coronal", "x", "z"), 2: ("axial", "x", "y")}
 
 
-def patient_page(patient: PatientModel, t1: Volume, path: str | Path) -> None:
+def patient_page(patient: PatientModel, t1: Volume, labels: Volume, path: str | Path) -> None:
     """Draw the page and write it as PNG (or whatever the suffix says).
 
     Parameters
@@ -47,43 +53,66 @@ def patient_page(patient: PatientModel, t1: Volume, path: str | Path) -> None:
         With septa or without.
     t1
         The MR that the model was made from.
+    labels
+        The label image that the model was made from, on any grid.
     path
         Output file.
     """
-    figure = Figure(figsize=(19, 12), layout="constrained")
-    axes = [[figure.add_subplot(2, 3, 1 + 3 * row + column) for column in range(3 - row)] for row in range(2)]
-    centre = _centre(patient)
-    for axes_2d, axis, at in zip(axes[0], (0, 1, 2), (0.004, -0.055, centre[2]), strict=True):
-        draw_slice(axes_2d, patient, t1, axis, at)
-    draw_cut(axes[1][0], patient, 1, centre[1])
-    draw_cut(axes[1][1], patient, 2, centre[2])
-    _draw_septa_in_space(cast(Axes3D, figure.add_subplot(2, 3, 6, projection="3d")), patient)
-    _inset_quality(axes[1][1], patient)
-    handles = [Patch(color=colour, label=region.name.lower().replace("_", " ")) for region, colour in REGION_COLOURS.items()]
+    figure = Figure(figsize=(25, 12), layout="constrained")
+    grid = figure.add_gridspec(2, 4, width_ratios=(1.0, 1.0, 1.0, 0.55))
+    at = _places(patient)
+    window = _grey_window(patient, t1)
+    for axis in range(3):
+        draw_slice(figure.add_subplot(grid[0, axis]), patient, t1, labels, axis, at[axis], window)
+    for column, axis in enumerate((1, 2)):
+        draw_cut(figure.add_subplot(grid[1, column]), patient, axis, _centre(patient)[axis])
+    _draw_septa_in_space(cast(Axes3D, figure.add_subplot(grid[1, 2], projection="3d")), patient)
+    _draw_quality(figure.add_subplot(grid[0, 3]), patient)
+    _write_figures(figure.add_subplot(grid[1, 3]), patient)
+    present = [region for region in REGION_COLOURS if np.any(patient.mesh.region == region)]
+    handles: list[Artist] = [
+        Patch(color=REGION_COLOURS[region], label=region.name.lower().replace("_", " ")) for region in present
+    ]
     handles += [Patch(color=colour, label=name) for name, colour in SEPTA_COLOURS.items() if name in patient.mesh.facets]
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    handles += [
+        Line2D([], [], color="white", linewidth=1.5, label="label image"),
+        Line2D([], [], color=REGION_COLOURS[Region.LEFT_CEREBRUM], linestyle="--", label="the mesh's outline"),
+    ]
+    legend = figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=True)
+    legend.get_frame().set_facecolor("#d0cdc8")
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=90)
+        figure.savefig(temporary, dpi=80)
 
 
-def draw_slice(axes: Axes, patient: PatientModel, t1: Volume, axis: int, at: float) -> None:
-    """Show the MR on the plane where coordinate `axis` equals `at` (metres), with outlines of regions and septa."""
+def draw_slice(
+    axes: Axes, patient: PatientModel, t1: Volume, labels: Volume, axis: int, at: float, window: tuple[float, float]
+) -> None:
+    """Show the MR on the plane where coordinate `axis` equals `at` (metres), with contours of labels, mesh and septa.
+
+    Solid lines are the borders of the label image, dashed ones those of the mesh; `window` is the intensity range shown.
+    """
     first, second = (k for k in range(3) if k != axis)
-    low, high = patient.mesh.nodes.min(axis=0) - 0.006, patient.mesh.nodes.max(axis=0) + 0.006
-    u, v = (np.arange(low[k], high[k], 0.001) for k in (first, second))
+    low, high = patient.mesh.nodes.min(axis=0) - 0.008, patient.mesh.nodes.max(axis=0) + 0.008
+    u, v = (np.arange(low[k], high[k], 0.0007) for k in (first, second))
     points = np.zeros((len(v), len(u), 3))
     points[..., axis], points[..., first], points[..., second] = at, u[None, :], v[:, None]
     extent = (float(m_to_mm(u[0])), float(m_to_mm(u[-1])), float(m_to_mm(v[0])), float(m_to_mm(v[-1])))
-    axes.imshow(sample(t1, points), cmap="gray", origin="lower", extent=extent)
-    section = _section(patient, axis, at)
+    axes.imshow(sample(t1, points), cmap="gray", origin="lower", extent=extent, vmin=window[0], vmax=window[1])
+    shown, section = sample(labels, points, "nearest"), _section(patient, axis, at)
     for region, colour in REGION_COLOURS.items():
-        cells = section.extract_cells(section.cell_data["region"] == region)
-        edges = cells.extract_surface(algorithm=None).extract_feature_edges(
-            boundary_edges=True, feature_edges=False, manifold_edges=False, non_manifold_edges=False
-        )
-        axes.add_collection(LineCollection(_segments(edges, first, second), colors=colour, linewidths=1.0))
+        if np.any(shown == region):
+            axes.contour(m_to_mm(u), m_to_mm(v), shown == region, levels=[0.5], colors=colour, linewidths=0.9)
+        edges = _outline(section, region)
+        axes.add_collection(LineCollection(_segments(edges, first, second), colors=colour, linewidths=0.8, linestyles="--"))
     _draw_septa_lines(axes, patient, axis, at)
     _name_plane(axes, axis, at)
+
+
+def _outline(section: pv.PolyData, region: Region) -> pv.PolyData:
+    cells = section.extract_cells(section.cell_data["region"] == region)
+    return cells.extract_surface(algorithm=None).extract_feature_edges(
+        boundary_edges=True, feature_edges=False, manifold_edges=False, non_manifold_edges=False
+    )
 
 
 def draw_cut(axes: Axes, patient: PatientModel, axis: int, at: float) -> None:
@@ -100,12 +129,29 @@ def draw_cut(axes: Axes, patient: PatientModel, axis: int, at: float) -> None:
     _name_plane(axes, axis, at)
 
 
+def _places(patient: PatientModel) -> NDArray[np.float64]:
+    """Where the slices lie: beside the falx, through the tentorium, through the tumour; else through the centre."""
+    mesh, at = patient.mesh, _centre(patient)
+    if "falx" in mesh.facets:
+        at[0] = mesh.nodes[mesh.facets["falx"]].mean(axis=(0, 1))[0] + BESIDE_FALX_M
+    if "tentorium" in mesh.facets:
+        at[1] = mesh.nodes[mesh.facets["tentorium"]].mean(axis=(0, 1))[1]
+    return at
+
+
+def _grey_window(patient: PatientModel, t1: Volume) -> tuple[float, float]:
+    """Intensities between which the MR is shown: a scalp is brighter than any brain."""
+    centroids = patient.mesh.nodes[patient.mesh.elements].mean(axis=1)
+    return 0.0, float(1.15 * np.percentile(sample(t1, centroids), 99.0))
+
+
 def _centre(patient: PatientModel) -> NDArray[np.float64]:
     """Where to cut: through the tumour if there is one."""
     mesh = patient.mesh
     tumor = mesh.region == Region.TUMOR
     chosen = mesh.elements[tumor] if tumor.any() else mesh.elements
-    return mesh.nodes[chosen].mean(axis=(0, 1))
+    centre: NDArray[np.float64] = mesh.nodes[chosen].mean(axis=(0, 1))
+    return centre
 
 
 def _section(patient: PatientModel, axis: int, at: float) -> pv.PolyData:
@@ -164,10 +210,20 @@ def _draw_septa_in_space(axes: Axes3D, patient: PatientModel) -> None:
     axes.set_title("septa in the mesh, from the left and behind", fontsize=10)
 
 
-def _inset_quality(axes: Axes, patient: PatientModel) -> None:
+def _draw_quality(axes: Axes, patient: PatientModel) -> None:
     angles = dihedral_angles_deg(patient.mesh.nodes, patient.mesh.elements).min(axis=1)
-    inset = axes.inset_axes((1.06, 0.05, 0.3, 0.2))
-    inset.hist(angles, bins=24, range=(0.0, 72.0), color="#5b7fa6")
-    inset.set_title(f"smallest dihedral angle (min {angles.min():.0f}°)", fontsize=7)
-    inset.tick_params(labelsize=6)
-    inset.set_yticks([])
+    limit = LIMITS["dihedral_min_deg"][0]
+    axes.hist(angles, bins=36, range=(0.0, 72.0), color="#5b7fa6")
+    axes.axvline(limit, color="#c0392b", linewidth=1.5)
+    axes.set_title(
+        f"smallest dihedral angle of each element\nsmallest of all {angles.min():.1f}°, allowed {limit:g}°", fontsize=10
+    )
+    axes.set_xlabel("degrees")
+    axes.set_ylabel("elements")
+
+
+def _write_figures(axes: Axes, patient: PatientModel) -> None:
+    axes.set_axis_off()
+    lines = [f"{name:34} {value:10.4g}" for name, value in patient.quality.items()]
+    text = "\n".join([patient.image.name, "", *lines, "", *(fill(f"! {warning}", 46) for warning in patient.warnings)])
+    axes.text(0.0, 1.0, text, va="top", family="monospace", fontsize=8.5, transform=axes.transAxes)

@@ -1,0 +1,33 @@
+"""`brainshift experiment`: a study of accuracy, speed or stability, with its figures and pictures."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+
+import click
+from rich.console import Console
+
+from brainshift_ros.cli.progress import stage_bars
+
+#: Name -> module with `run(folder, full, progress)`, and the question that it answers.
+EXPERIMENTS: dict[str, tuple[str, str]] = {
+    "segmentation": ("brainshift_ros.experiments.segmentation", "How far is automatic segmentation from the truth?"),
+    "registration": ("brainshift_ros.experiments.registration", "What does registration accuracy cost in time? (E7)"),
+    "meshing": ("brainshift_ros.experiments.meshing", "What does mesh size cost in time and memory? (E7)"),
+    "septa-gap": ("brainshift_ros.experiments.septa_gap", "What does a gap between septa and skull do to the field?"),
+}
+
+
+@click.command("experiment", epilog=" ".join(f"{name}: {question}" for name, (_, question) in EXPERIMENTS.items()))
+@click.argument("name", type=click.Choice(sorted(EXPERIMENTS)))
+@click.option("--full", is_flag=True, help="The whole study, which takes long; without it a short one.")
+@click.option("--output", type=click.Path(path_type=Path), default=Path("out/experiments"), show_default=True)
+def command(name: str, full: bool, output: Path) -> None:
+    """Run a study; write summary.json, CSV and PNG to OUTPUT/NAME."""
+    folder = output / name
+    folder.mkdir(parents=True, exist_ok=True)
+    console = Console(stderr=True)
+    with stage_bars(console) as report:
+        import_module(EXPERIMENTS[name][0]).run(folder, full, report)
+    console.print(f"written: {folder}/summary.json and what lies beside it")

@@ -1,0 +1,1 @@
+"""Studies that decide defaults: each writes summary.json, CSV and PNG into a folder."""
