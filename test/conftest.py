@@ -9,8 +9,8 @@ from brainshift_ros.h5 import digest
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.mesh.build import build_patient
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
-from brainshift_ros.mesh.septa_template import septa_from_template
 from brainshift_ros.mesh.template_patient import template_patient_images
+from brainshift_ros.septa.template import septa_from_template
 
 
 @pytest.fixture(scope="session")

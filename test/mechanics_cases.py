@@ -6,10 +6,10 @@ import numpy as np
 from skfem import MeshTet
 
 from brainshift_ros.image.volume import Region
-from brainshift_ros.mesh.facets import LOCAL_FACES
 from brainshift_ros.mesh.patient import ImageReference, PatientModel, Tissue
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.surface.facets import LOCAL_FACES
+from brainshift_ros.surface.surface import Surface
 
 
 def box(counts, size=(1.0, 1.0, 1.0), jiggle=0.0, seed=0):

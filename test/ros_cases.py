@@ -18,9 +18,9 @@ from brainshift_ros.correspondence.homologous import HomologousPoints
 from brainshift_ros.geometry import rigid, transform_points, unit
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
 from brainshift_ros.mesh.patient_file import patient_digest
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.tetmesh import TetMesh
 from brainshift_ros.simulation.scanner import Scanner, make_scene, scanner_pose, take_scan
+from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import affine_mm_to_m
 
 SIZE_M = 0.14

@@ -20,7 +20,7 @@ from brainshift_ros.correspondence.homologous import HomologousPoints
 from brainshift_ros.errors import InputError
 from brainshift_ros.field.deformation import Deformation
 from brainshift_ros.field.field_file import read_field, write_field
-from brainshift_ros.field.grid import Grid
+from brainshift_ros.image.grid import Grid
 from brainshift_ros.image.io import read_volume, write_volume
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.inverse.points_csv import write_homologous_points

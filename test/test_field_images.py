@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 from brainshift_ros.errors import InputError
 from brainshift_ros.field.deformation import Deformation
 from brainshift_ros.field.displacement import DisplacementField
-from brainshift_ros.field.grid import Grid
-from brainshift_ros.field.itk import read_displacement_image, write_displacement_image
 from brainshift_ros.field.warp import resample_through, warp_image, warp_surface
+from brainshift_ros.image.grid import Grid
 from brainshift_ros.image.io import write_volume
+from brainshift_ros.image.itk import read_displacement_image, write_displacement_image
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.mesh.nearest import boundary_faces
-from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.surface.surface import Surface
 
 MESH = ellipsoid_mesh(8)
 DEFORMATION = Deformation(smooth_field(MESH), spacing=0.004)

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from brainshift_ros.field.deformation import Deformation
 from brainshift_ros.field.displacement import DisplacementField
-from brainshift_ros.field.grid import Grid, trilinear
 from brainshift_ros.field.raster import interpolate, rasterise
+from brainshift_ros.image.grid import Grid, trilinear
 from brainshift_ros.mesh.locate import PointLocator
 
 MESH = ellipsoid_mesh(10)

@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from brainshift_ros.field.deformation import Deformation
-from brainshift_ros.field.grid import Grid
 from brainshift_ros.field.warp import warp_image
+from brainshift_ros.image.grid import Grid
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.mesh.nearest import boundary_faces
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.pictures.field import contour_step, displacement_map, mr_before_after, vectors_on_cortex
 from brainshift_ros.pictures.slices import three_slices
+from brainshift_ros.surface.surface import Surface
 
 MESH = ellipsoid_mesh(8)
 GRID = Grid((50, 52, 48), np.array([[0.003, 0, 0, -0.074], [0, 0.003, 0, -0.077], [0, 0, 0.003, -0.07], [0, 0, 0, 1.0]]))

@@ -17,14 +17,15 @@ from brainshift_ros.errors import InputError
 from brainshift_ros.image.template import template_landmarks
 from brainshift_ros.image.volume import Region, Volume
 from brainshift_ros.mesh.build import build_patient
-from brainshift_ros.mesh.facets import face_table, facet_areas
 from brainshift_ros.mesh.patient import PatientModel, Tissue
 from brainshift_ros.mesh.patient_file import read_patient, write_patient
 from brainshift_ros.mesh.quality import dihedral_angles_deg, refuse_bad_mesh
-from brainshift_ros.mesh.sheets import Septum, septa_from_landmarks, sheet
-from brainshift_ros.mesh.side import merged, side_of_sheet
 from brainshift_ros.mesh.split import split_along_septa
 from brainshift_ros.mesh.volume import restore_volume
+from brainshift_ros.septa.sheets import Septum, septa_from_landmarks, sheet
+from brainshift_ros.septa.side import side_of_sheet
+from brainshift_ros.surface.facets import face_table, facet_areas
+from brainshift_ros.surface.surfacing import merged
 
 
 def keys(facets: np.ndarray) -> set[tuple[int, ...]]:

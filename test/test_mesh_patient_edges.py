@@ -11,12 +11,12 @@ from brainshift_ros.image.template import template_landmarks
 from brainshift_ros.image.volume import Region, Volume
 from brainshift_ros.mechanics.submesh import remove_elements, unsupported_elements
 from brainshift_ros.mesh.build import build_patient
-from brainshift_ros.mesh.facets import components, face_table
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
 from brainshift_ros.mesh.quality import refuse_bad_mesh
-from brainshift_ros.mesh.sheets import septa_from_landmarks
 from brainshift_ros.mesh.template_patient import template_patient_images
 from brainshift_ros.mesh.tumors import meshed_tumor
+from brainshift_ros.septa.sheets import septa_from_landmarks
+from brainshift_ros.surface.facets import components, face_table
 from brainshift_ros.units import m_to_mm
 
 ML = 1e-6

@@ -12,7 +12,6 @@ from skfem.helpers import dot, grad
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.image.volume import Region, Volume
-from brainshift_ros.mesh.facets import face_table
 from brainshift_ros.mesh.improve import GOAL_DEG, raise_angles
 from brainshift_ros.mesh.patient import PatientModel, Tissue
 from brainshift_ros.mesh.quality import dihedral_angles_deg
@@ -25,9 +24,10 @@ from brainshift_ros.mesh.sizing import (
     edge_length_for,
     effective_radius,
 )
-from brainshift_ros.mesh.surfacing import surface_of_mask
 from brainshift_ros.mesh.tetmesh import tetrahedron_volumes
 from brainshift_ros.mesh.tissue import classify_tissue
+from brainshift_ros.surface.facets import face_table
+from brainshift_ros.surface.surfacing import surface_of_mask
 
 
 def grid(steps: int) -> tuple[np.ndarray, np.ndarray]:

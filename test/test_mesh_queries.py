@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from brainshift_ros.mesh.queries import RayCaster, closest_points, inside
-from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.surface.queries import RayCaster, closest_points, inside
+from brainshift_ros.surface.surface import Surface
 
 SIZE = 0.05
 OCTAHEDRON = Surface(

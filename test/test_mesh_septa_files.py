@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.mesh.queries import closest_points
-from brainshift_ros.mesh.septa_files import read_septa, write_septa
-from brainshift_ros.mesh.sheets import Septum
-from brainshift_ros.mesh.surfacing import face_areas, vertex_normals
 from brainshift_ros.resources import resource
+from brainshift_ros.septa.files import read_septa, write_septa
+from brainshift_ros.septa.sheets import Septum
+from brainshift_ros.surface.queries import closest_points
+from brainshift_ros.surface.surfacing import face_areas, vertex_normals
 
 EXAMPLE = resource("config/septa_example.yaml")
 FULL = resource("config/template_mni152.yaml")

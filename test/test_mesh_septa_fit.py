@@ -9,9 +9,9 @@ import pytest
 import pyvista as pv
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.mesh.septa_fit import check_septa
-from brainshift_ros.mesh.sheets import Septum, sheet
-from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.septa.fit import check_septa
+from brainshift_ros.septa.sheets import Septum, sheet
+from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import mm_to_m
 
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.image.landmarks import SeptaSketch
-from brainshift_ros.mesh.septa_sketch import septa_from_sketch
-from brainshift_ros.mesh.sheets import Septum
-from brainshift_ros.mesh.surfacing import face_areas
+from brainshift_ros.septa.sheets import Septum
+from brainshift_ros.septa.sketch import septa_from_sketch
+from brainshift_ros.surface.surfacing import face_areas
 
 RADIUS, TOP = 120.0, 60.0  # of a roof z = TOP - RADIUS + sqrt(RADIUS^2 - x^2), mm
 

@@ -11,15 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from brainshift_ros.experiments import septa_gap
 from brainshift_ros.image.volume import Region
-from brainshift_ros.mesh.facets import components, face_table, facet_areas
 from brainshift_ros.mesh.patient import PatientModel
 from brainshift_ros.mesh.septa_gap import gap_figures
 from brainshift_ros.mesh.septa_join import with_gap
-from brainshift_ros.mesh.septa_template import septa_from_template
-from brainshift_ros.mesh.sheets import Septum, sheet
 from brainshift_ros.mesh.split import SplitMesh, split_along_septa
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.septa.sheets import Septum, sheet
+from brainshift_ros.septa.template import septa_from_template
+from brainshift_ros.surface.facets import components, face_table, facet_areas
+from brainshift_ros.surface.surface import Surface
 
 SIDE = 0.08  # of the cube in which the sheets stand, metres
 CELLS = 8  # along it: cells of 10 mm

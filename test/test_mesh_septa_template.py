@@ -12,12 +12,12 @@ from brainshift_ros.errors import InputError
 from brainshift_ros.image.resample import sample
 from brainshift_ros.image.template import template_landmarks
 from brainshift_ros.image.volume import Volume
-from brainshift_ros.mesh.queries import closest_points
-from brainshift_ros.mesh.septa_strip import with_strips
-from brainshift_ros.mesh.septa_template import septa_from_template
-from brainshift_ros.mesh.sheets import Septum, septa_from_landmarks, sheet
-from brainshift_ros.mesh.surfacing import vertex_normals
+from brainshift_ros.septa.sheets import Septum, septa_from_landmarks, sheet
+from brainshift_ros.septa.strip import with_strips
+from brainshift_ros.septa.template import septa_from_template
 from brainshift_ros.simulation.truth import smooth_random_field
+from brainshift_ros.surface.queries import closest_points
+from brainshift_ros.surface.surfacing import vertex_normals
 
 SPACING_MM = 6.0
 

@@ -9,14 +9,15 @@ from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import transform_points
 from brainshift_ros.image.template import template_landmarks
 from brainshift_ros.image.volume import Volume
-from brainshift_ros.mesh.cortex import CLOSING_MM, DEPTH_MM, cortical_surface
-from brainshift_ros.mesh.queries import inside
-from brainshift_ros.mesh.sheets import septa_from_landmarks, sheet
-from brainshift_ros.mesh.side import merged, side_of_sheet
-from brainshift_ros.mesh.surfacing import (
+from brainshift_ros.septa.sheets import septa_from_landmarks, sheet
+from brainshift_ros.septa.side import side_of_sheet
+from brainshift_ros.surface.cortex import CLOSING_MM, DEPTH_MM, cortical_surface
+from brainshift_ros.surface.queries import inside
+from brainshift_ros.surface.surfacing import (
     decimate,
     enclosed_volume,
     face_areas,
+    merged,
     smooth_laplacian,
     smooth_taubin,
     surface_of_mask,

@@ -155,3 +155,32 @@ def test_each_subcommand_is_a_module_with_a_command():
     for name, (module, _) in COMMANDS.items():
         path = ROOT / (module.replace(".", "/") + ".py")
         assert path.is_file(), f"brainshift {name} has no module"
+
+
+#: Folder of the core -> folders that it may import: data flows one way (docs/architecture.md).
+MAY_IMPORT = {
+    "image": set(),
+    "segmentation": {"image"},
+    "surface": {"image"},
+    "septa": {"image", "surface"},
+    "mesh": {"image", "segmentation", "surface", "septa"},
+    "mechanics": {"image", "surface", "mesh"},
+    "atlas": {"mesh", "mechanics"},
+    "registration": {"surface"},
+    "correspondence": {"surface", "registration"},
+    "field": {"image", "surface", "mesh"},
+    "inverse": {"mesh", "atlas", "correspondence", "field"},
+    "evaluation": {"image", "surface", "septa"},
+}
+
+
+@pytest.mark.parametrize("folder", MAY_IMPORT)
+def test_data_flows_one_way(folder):
+    folders = {path.name for path in PACKAGE.iterdir() if path.is_dir()}
+    used = {
+        parts[1]
+        for path in (PACKAGE / folder).glob("*.py")
+        for parts in (name.split(".") for name in imports(path) if name.startswith("brainshift_ros."))
+        if parts[1] in folders
+    }
+    assert used <= MAY_IMPORT[folder] | {folder}

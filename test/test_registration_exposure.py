@@ -7,11 +7,11 @@ import pytest
 from simulation_cases import mni_cortex
 from skimage.measure import marching_cubes
 
-from brainshift_ros.mesh.queries import RayCaster
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.registration.exposure import covering_samples, open_fraction, sphere_directions
 from brainshift_ros.registration.target import prepare_target
 from brainshift_ros.registration.thinning import voxel_means
+from brainshift_ros.surface.queries import RayCaster
+from brainshift_ros.surface.surface import Surface
 
 
 def ball(radius, cells=25):

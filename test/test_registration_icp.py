@@ -14,12 +14,12 @@ from skimage.measure import marching_cubes
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import invert_rigid, rigid, transform_points, unit
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.registration.icp import robust_icp, tukey_weight
 from brainshift_ros.registration.opening import opening_mask, pixel_spacing
 from brainshift_ros.registration.register import register_scan
 from brainshift_ros.registration.target import prepare_target
 from brainshift_ros.registration.verdict import skew
+from brainshift_ros.surface.surface import Surface
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

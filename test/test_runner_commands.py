@@ -18,10 +18,10 @@ from brainshift_ros.cli.run import command as run_command
 from brainshift_ros.errors import InputError
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
 from brainshift_ros.mesh.patient_file import patient_digest, write_patient
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.registration.scan import OrganisedScan
 from brainshift_ros.resources import resource
 from brainshift_ros.runner import ros_environment
+from brainshift_ros.surface.surface import Surface
 
 BRAINSHIFT = [sys.executable, "-m", "brainshift_ros.cli.main"]
 

@@ -14,8 +14,8 @@ from brainshift_ros.image.template import template_labels, template_landmarks
 from brainshift_ros.image.tumor import TumorShape
 from brainshift_ros.image.volume import Region
 from brainshift_ros.mesh.patient_file import read_patient
-from brainshift_ros.mesh.septa_files import write_septa
 from brainshift_ros.segmentation.segment import Segmentation, carried
+from brainshift_ros.septa.files import write_septa
 from brainshift_ros.simulation.synthetic_patient import synthetic_patient
 
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.field.grid import Grid
 from brainshift_ros.geometry import T_LPS_RAS, rigid, transform_points
+from brainshift_ros.image.grid import Grid
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.segmentation.checks import check_linear, check_map
 from brainshift_ros.segmentation.greedy import run_greedy

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.field.grid import Grid
+from brainshift_ros.evaluation.overlap import dice
+from brainshift_ros.image.grid import Grid
 from brainshift_ros.image.template import template_landmarks
 from brainshift_ros.image.tumor import TumorShape
 from brainshift_ros.image.volume import Region, Volume
-from brainshift_ros.mesh.sheets import septa_from_landmarks
-from brainshift_ros.segmentation.overlap import dice
 from brainshift_ros.segmentation.segment import Segmentation, segment
 from brainshift_ros.segmentation.settings import SegmentationSettings
+from brainshift_ros.septa.sheets import septa_from_landmarks
 from brainshift_ros.simulation.synthetic_patient import SyntheticPatient, synthetic_patient
 from brainshift_ros.units import m_to_mm
 
@@ -95,12 +95,6 @@ def test_head_upside_down_is_refused(thick_slices: SyntheticPatient) -> None:
     turned = np.diag([1.0, -1.0, -1.0, 1.0]) @ thick_slices.t1.T_patient_voxel
     with pytest.raises(InputError, match="orientation"):
         segment(Volume(thick_slices.t1.data, turned), settings=COARSE)
-
-
-def test_noise_is_refused() -> None:
-    noise = np.random.default_rng(0).random((60, 60, 60), dtype=np.float32)
-    with pytest.raises(InputError, match="give --labels"):
-        segment(Volume(noise, np.diag([0.003, 0.003, 0.003, 1.0])), settings=COARSE)
 
 
 @pytest.mark.slow

@@ -11,14 +11,14 @@ import SimpleITK as sitk  # noqa: N813
 from scipy.spatial.transform import Rotation
 
 from brainshift_ros.errors import InputError
+from brainshift_ros.evaluation.overlap import region_agreement
+from brainshift_ros.evaluation.report import compare_segmentations
+from brainshift_ros.evaluation.septa_distance import points_on, septa_distances
+from brainshift_ros.evaluation.slice_errors import slice_errors, widest_disc_mm
 from brainshift_ros.geometry import rigid, transform_points
 from brainshift_ros.image.volume import Region, Volume
-from brainshift_ros.mesh.sheets import Septum
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.segmentation.overlap import region_agreement
-from brainshift_ros.segmentation.report import compare_segmentations
-from brainshift_ros.segmentation.septa_distance import points_on, septa_distances
-from brainshift_ros.segmentation.slice_errors import slice_errors, widest_disc_mm
+from brainshift_ros.septa.sheets import Septum
+from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import mm_to_m
 
 SIZE = 60

@@ -15,7 +15,7 @@ from brainshift_ros.image.resample import sample
 from brainshift_ros.image.template import template_labels, template_landmarks, template_t1
 from brainshift_ros.image.tumor import TumorShape
 from brainshift_ros.image.volume import Region, Volume
-from brainshift_ros.mesh.sheets import septa_from_landmarks
+from brainshift_ros.septa.sheets import septa_from_landmarks
 from brainshift_ros.simulation.synthetic_carry import block_mean
 from brainshift_ros.simulation.synthetic_grid import cut_off, oblique, reoriented, thick_slices
 from brainshift_ros.simulation.synthetic_mr import WHITE, Contrast, imaged, with_tumor

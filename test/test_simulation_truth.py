@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from brainshift_ros.atlas.orientations import directions_in_cone
-from brainshift_ros.mesh.queries import closest_points
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.simulation.targets import MIDLINE_M, target_groups
 from brainshift_ros.simulation.truth import direction_between, simulate_truth, smooth_random_field
+from brainshift_ros.surface.queries import closest_points
+from brainshift_ros.surface.surface import Surface
 
 UP = np.array([0.0, -0.94, -0.34]) / np.hypot(0.94, 0.34)
 CENTER = np.array([-0.035, 0.045, 0.050])

@@ -9,12 +9,12 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from brainshift_ros.evaluation.report import SegmentationReport, compare_segmentations
 from brainshift_ros.files import atomic_path, writable_target
 from brainshift_ros.image.io import read_volume
 from brainshift_ros.image.labels import labels_on_grid
-from brainshift_ros.mesh.septa_files import read_septa
-from brainshift_ros.mesh.sheets import septa_spacing_mm
-from brainshift_ros.segmentation.report import SegmentationReport, compare_segmentations
+from brainshift_ros.septa.files import read_septa
+from brainshift_ros.septa.sheets import septa_spacing_mm
 
 
 @click.command("compare")

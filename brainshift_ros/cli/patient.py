@@ -22,11 +22,11 @@ from brainshift_ros.mesh.build import build_patient
 from brainshift_ros.mesh.export import export_mesh
 from brainshift_ros.mesh.patient import PatientModel
 from brainshift_ros.mesh.patient_file import write_patient
-from brainshift_ros.mesh.septa_files import read_septa
-from brainshift_ros.mesh.septa_template import septa_from_template
-from brainshift_ros.mesh.sheets import Septum, septa_spacing_mm
 from brainshift_ros.pictures.patient_page import patient_page
 from brainshift_ros.segmentation.segment import Segmentation, segment
+from brainshift_ros.septa.files import read_septa
+from brainshift_ros.septa.sheets import Septum, septa_spacing_mm
+from brainshift_ros.septa.template import septa_from_template
 from brainshift_ros.units import mm_to_m
 
 Progress = Callable[[str, float], None]

@@ -11,10 +11,10 @@ from brainshift_ros.cli.images import read_tumors
 from brainshift_ros.cli.progress import stage_bars
 from brainshift_ros.files import writable_target
 from brainshift_ros.image.io import NIFTI_SUFFIXES, read_volume, write_volume
-from brainshift_ros.mesh.septa_files import MESH_SUFFIXES, write_septa
-from brainshift_ros.mesh.septa_template import septa_from_template
-from brainshift_ros.mesh.sheets import septa_spacing_mm
 from brainshift_ros.segmentation.segment import Segmentation, segment
+from brainshift_ros.septa.files import MESH_SUFFIXES, write_septa
+from brainshift_ros.septa.sheets import septa_spacing_mm
+from brainshift_ros.septa.template import septa_from_template
 
 
 @click.command("segment")

@@ -8,10 +8,10 @@ import click
 
 from brainshift_ros.field.deformation import Deformation
 from brainshift_ros.field.field_file import read_field
-from brainshift_ros.field.itk import write_displacement_image
 from brainshift_ros.field.warp import warp_image
 from brainshift_ros.files import writable_target
 from brainshift_ros.image.io import NIFTI_SUFFIXES, read_volume, write_volume
+from brainshift_ros.image.itk import write_displacement_image
 from brainshift_ros.units import m_to_mm
 
 

@@ -14,11 +14,11 @@ from brainshift_ros.correspondence.tracking import FirstView, Tracking, Tracking
 from brainshift_ros.correspondence.vessels import VesselTree, trace_vessels
 from brainshift_ros.geometry import transform_points
 from brainshift_ros.graph import PATIENT_FRAME
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.registration.checks import check_scan
 from brainshift_ros.registration.register import RegistrationOptions, RegistrationResult, check_pose, register_scan
 from brainshift_ros.registration.scan import OrganisedScan
 from brainshift_ros.registration.target import CortexTarget, prepare_target
+from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import m_to_mm
 
 

@@ -13,13 +13,13 @@ from brainshift_ros.demo.session import Session
 from brainshift_ros.demo.settings import DemoFiles
 from brainshift_ros.field.deformation import Deformation
 from brainshift_ros.field.displacement import DisplacementField
-from brainshift_ros.field.grid import Grid
-from brainshift_ros.field.itk import write_displacement_image
 from brainshift_ros.field.warp import warp_image
 from brainshift_ros.files import atomic_path
 from brainshift_ros.geometry import transform_points
 from brainshift_ros.graph import PATIENT_FRAME
+from brainshift_ros.image.grid import Grid
 from brainshift_ros.image.io import write_volume
+from brainshift_ros.image.itk import write_displacement_image
 from brainshift_ros.image.volume import Region, Volume
 from brainshift_ros.mesh.locate import PointLocator
 from brainshift_ros.mesh.patient import PatientModel

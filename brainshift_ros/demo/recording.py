@@ -12,13 +12,13 @@ from brainshift_ros.atlas.file import AtlasFile
 from brainshift_ros.bags import BagWriter
 from brainshift_ros.demo.settings import DemoFiles, DemoSettings
 from brainshift_ros.geometry import invert_rigid, rigid, transform_points, unit
-from brainshift_ros.mesh.cortex import cortical_surface
 from brainshift_ros.mesh.patient import PatientModel
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.mesh.surfacing import vertex_normals
 from brainshift_ros.mesh.template_patient import TemplateImages
 from brainshift_ros.simulation.scanner import Scanner, SimulatedScan, SurgicalScene, make_scene, scanner_pose, take_scan
 from brainshift_ros.simulation.truth import Truth, direction_between, simulate_truth, smooth_random_field
+from brainshift_ros.surface.cortex import cortical_surface
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import vertex_normals
 from brainshift_ros.units import mm_to_m
 
 #: Times of the recording: any fixed moment serves, and a fixed one gives the same bag each time.

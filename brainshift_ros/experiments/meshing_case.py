@@ -9,8 +9,8 @@ from pathlib import Path
 from brainshift_ros.experiments.stopwatch import Stopwatch
 from brainshift_ros.mesh.build import build_patient
 from brainshift_ros.mesh.patient import ImageReference
-from brainshift_ros.mesh.sheets import septa_spacing_mm
 from brainshift_ros.mesh.template_patient import template_patient_images
+from brainshift_ros.septa.sheets import septa_spacing_mm
 
 
 def main(nodes: int, made: Path) -> None:

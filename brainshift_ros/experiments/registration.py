@@ -20,6 +20,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from brainshift_ros.evaluation.overlap import dice
+from brainshift_ros.evaluation.septa_distance import septa_distances
 from brainshift_ros.experiments.registration_engines import Engine, ants_engine, demons_engine, greedy_engine
 from brainshift_ros.experiments.results import write_figure, write_results
 from brainshift_ros.experiments.stopwatch import Stopwatch
@@ -27,11 +29,9 @@ from brainshift_ros.image.labels import add_tumor
 from brainshift_ros.image.template import template_labels, template_landmarks, template_t1
 from brainshift_ros.image.tumor import TumorShape
 from brainshift_ros.image.volume import Region
-from brainshift_ros.mesh.septa_template import septa_from_template
-from brainshift_ros.segmentation.overlap import dice
 from brainshift_ros.segmentation.segment import carried
-from brainshift_ros.segmentation.septa_distance import septa_distances
 from brainshift_ros.segmentation.settings import SegmentationSettings
+from brainshift_ros.septa.template import septa_from_template
 from brainshift_ros.simulation.synthetic_patient import SyntheticPatient, synthetic_patient
 from brainshift_ros.units import m_to_mm
 

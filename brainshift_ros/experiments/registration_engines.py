@@ -12,9 +12,9 @@ import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
 
 from brainshift_ros.experiments import registration_ants
-from brainshift_ros.field.itk import read_displacement_image
 from brainshift_ros.geometry import T_LPS_RAS
 from brainshift_ros.image.io import write_volume
+from brainshift_ros.image.itk import read_displacement_image
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.segmentation.register import register_linear, register_nonrigid
 from brainshift_ros.segmentation.settings import SegmentationSettings

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from brainshift_ros.evaluation.report import SegmentationReport, compare_segmentations
 from brainshift_ros.experiments.results import write_figure, write_results
 from brainshift_ros.experiments.stopwatch import Stopwatch
 from brainshift_ros.image.tumor import TumorShape
-from brainshift_ros.mesh.septa_template import septa_from_template
-from brainshift_ros.segmentation.report import SegmentationReport, compare_segmentations
 from brainshift_ros.segmentation.segment import segment
+from brainshift_ros.septa.template import septa_from_template
 from brainshift_ros.simulation.synthetic_patient import synthetic_patient
 
 Progress = Callable[[str, float], None]

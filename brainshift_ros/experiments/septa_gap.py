@@ -24,10 +24,10 @@ from brainshift_ros.mesh.locate import PointLocator
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
 from brainshift_ros.mesh.septa_gap import gap_figures
 from brainshift_ros.mesh.septa_join import with_gap
-from brainshift_ros.mesh.septa_template import septa_from_template
-from brainshift_ros.mesh.sheets import Septum, septa_spacing_mm
 from brainshift_ros.mesh.template_patient import template_patient_images
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.septa.sheets import Septum, septa_spacing_mm
+from brainshift_ros.septa.template import septa_from_template
 from brainshift_ros.simulation.targets import target_groups
 from brainshift_ros.units import m_to_mm, mm_to_m
 

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from brainshift_ros.field.displacement import DisplacementField
-from brainshift_ros.field.grid import Grid, reached, trilinear
 from brainshift_ros.field.raster import interpolate, rasterise
+from brainshift_ros.image.grid import Grid, reached, trilinear
 from brainshift_ros.mesh.locate import PointLocator
 
 #: The field fades to zero over at least this distance from the brain, metres...

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from brainshift_ros.field.grid import Grid
+from brainshift_ros.image.grid import Grid
 
 #: Voxel centres this far outside an element, in barycentric coordinates, still count: faces leave no gaps.
 _TOLERANCE = 1e-7

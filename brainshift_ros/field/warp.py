@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainshift_ros.field.deformation import Deformation
-from brainshift_ros.field.grid import Grid, reached, trilinear
+from brainshift_ros.image.grid import Grid, reached, trilinear
 from brainshift_ros.image.volume import Volume
-from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.surface.surface import Surface
 
 Interpolation = Literal["linear", "nearest"]
 

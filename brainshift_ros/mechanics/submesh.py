@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.mesh.facets import LOCAL_FACES
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.surface.facets import LOCAL_FACES
 
 SHEETS = ("falx", "tentorium")
 

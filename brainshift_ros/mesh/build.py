@@ -14,25 +14,25 @@ from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import invert_rigid, rigid, transform_points
 from brainshift_ros.image.labels import cropped, edge_warnings, labels_on_grid
 from brainshift_ros.image.volume import Region, Volume
-from brainshift_ros.mesh.cortex import cortical_surface
-from brainshift_ros.mesh.facets import compact, components, face_table
 from brainshift_ros.mesh.fidelity import fidelity
 from brainshift_ros.mesh.fit import fitted_nodes
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
 from brainshift_ros.mesh.patient_file import patient_digest
 from brainshift_ros.mesh.quality import dihedral_angles_deg, element_quality, faults, refuse_bad_mesh
-from brainshift_ros.mesh.queries import closest_points, inside
 from brainshift_ros.mesh.regions import regions_of
-from brainshift_ros.mesh.septa_fit import check_septa
 from brainshift_ros.mesh.septa_gap import gap_figures
 from brainshift_ros.mesh.shapes import Shapes, shapes_of, surface_figures
-from brainshift_ros.mesh.sheets import Septum
 from brainshift_ros.mesh.sizing import Craniotomy, effective_radius, size_field
 from brainshift_ros.mesh.split import split_along_septa
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.tetmesh import TetMesh
 from brainshift_ros.mesh.tetwild import Tetrahedra, tetrahedralize
 from brainshift_ros.mesh.tissue import classify_tissue
+from brainshift_ros.septa.fit import check_septa
+from brainshift_ros.septa.sheets import Septum
+from brainshift_ros.surface.cortex import cortical_surface
+from brainshift_ros.surface.facets import compact, components, face_table
+from brainshift_ros.surface.queries import closest_points, inside
+from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import m_to_mm
 
 Progress = Callable[[str, float], None]

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from brainshift_ros.mesh.facets import facet_areas
 from brainshift_ros.mesh.quality import relative_error_percent
-from brainshift_ros.mesh.queries import closest_points, inside
 from brainshift_ros.mesh.shapes import Shapes
-from brainshift_ros.mesh.split import sheet_surfaces
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.mesh.surfacing import face_areas
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.septa.sheets import sheet_surfaces
+from brainshift_ros.surface.facets import facet_areas
+from brainshift_ros.surface.queries import closest_points, inside
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import face_areas
 from brainshift_ros.units import m3_to_ml, m_to_mm
 
 #: A facet leaves its sheet if a corner is this many edge lengths off: twice what the mesher is allowed.

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from brainshift_ros.mesh.facets import LOCAL_FACES
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.surface.facets import LOCAL_FACES
 
 
 def boundary_faces(elements: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

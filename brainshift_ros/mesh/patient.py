@@ -9,9 +9,9 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.tetmesh import TetMesh
 from brainshift_ros.segmentation.template_map import TemplateMap
+from brainshift_ros.surface.surface import Surface
 
 
 class Tissue(IntEnum):

@@ -12,9 +12,9 @@ from brainshift_ros.errors import InputError
 from brainshift_ros.files import atomic_path
 from brainshift_ros.h5 import digest, digest_of_mesh, open_checked, read_mesh, write_header, write_mesh
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.tetmesh import TetMesh
 from brainshift_ros.segmentation.template_map import TemplateMap
+from brainshift_ros.surface.surface import Surface
 
 KIND, VERSION = "patient", 1
 _REMEDY = "the file was changed or damaged; make it again with `brainshift patient`"

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.mesh.facets import components, face_table
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.surface.facets import components, face_table
 from brainshift_ros.units import m3_to_ml, m_to_mm
 
 #: Figure -> (lowest, highest) value that passes.

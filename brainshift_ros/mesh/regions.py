@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from brainshift_ros.image.resample import sample
 from brainshift_ros.image.volume import Region
-from brainshift_ros.mesh.facets import face_table, facet_areas
-from brainshift_ros.mesh.queries import closest_points, inside
 from brainshift_ros.mesh.shapes import Shapes, filled
-from brainshift_ros.mesh.side import side_of_sheet
-from brainshift_ros.mesh.split import sheet_surfaces
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.tetmesh import tetrahedron_volumes
+from brainshift_ros.septa.sheets import sheet_surfaces
+from brainshift_ros.septa.side import side_of_sheet
+from brainshift_ros.surface.facets import face_table, facet_areas
+from brainshift_ros.surface.queries import closest_points, inside
+from brainshift_ros.surface.surface import Surface
 
 #: Within this distance of a sheet, metres, an element's side of it decides, not the label.
 _NEAR = 0.01

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from brainshift_ros.mesh.queries import closest_points, inside
-from brainshift_ros.mesh.sheets import Septum
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.septa.sheets import Septum
+from brainshift_ros.surface.queries import closest_points, inside
+from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import m_to_mm
 
 _STEP_M = 0.001

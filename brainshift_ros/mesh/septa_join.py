@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from brainshift_ros.mesh.facets import components
-from brainshift_ros.mesh.queries import closest_points
 from brainshift_ros.mesh.split import rim_nodes
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.surface.facets import components
+from brainshift_ros.surface.queries import closest_points
+from brainshift_ros.surface.surface import Surface
 
 
 def with_gap(mesh: TetMesh, gap: float) -> tuple[TetMesh, NDArray[np.int64]]:

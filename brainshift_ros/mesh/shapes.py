@@ -11,11 +11,12 @@ from scipy import ndimage
 
 from brainshift_ros.image.labels import largest_component, voxel_volume
 from brainshift_ros.image.volume import Region, Volume
-from brainshift_ros.mesh.queries import closest_points
-from brainshift_ros.mesh.sheets import Septum
 from brainshift_ros.mesh.sizing import Craniotomy, edge_length_for, effective_radius
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.mesh.surfacing import (
+from brainshift_ros.mesh.tumors import TumorPiece, meshed_tumor, tumor_pieces
+from brainshift_ros.septa.sheets import Septum
+from brainshift_ros.surface.queries import closest_points
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import (
     decimate,
     enclosed_volume,
     face_areas,
@@ -23,7 +24,6 @@ from brainshift_ros.mesh.surfacing import (
     smooth_taubin,
     surface_of_mask,
 )
-from brainshift_ros.mesh.tumors import TumorPiece, meshed_tumor, tumor_pieces
 from brainshift_ros.units import m3_to_ml, m_to_mm
 
 #: Blur that takes the voxels' steps off the brain's surface.

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from brainshift_ros.mesh.queries import closest_points, inside
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.mesh.surfacing import enclosed_volume, face_areas
+from brainshift_ros.surface.queries import closest_points, inside
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import enclosed_volume, face_areas
 
 #: Edge length in and at a tumour, and under the craniotomy, relative to that far away.
 TUMOR_REFINEMENT, CRANIOTOMY_REFINEMENT = 0.6, 0.7

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brainshift_ros.mesh.facets import FaceTable, components, face_table, facet_areas
-from brainshift_ros.mesh.queries import closest_points
-from brainshift_ros.mesh.sheets import Septum
-from brainshift_ros.mesh.side import merged, side_of_sheet
-from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.septa.sheets import Septum, sheet_surfaces
+from brainshift_ros.septa.side import side_of_sheet
+from brainshift_ros.surface.facets import FaceTable, components, face_table, facet_areas
+from brainshift_ros.surface.queries import closest_points
+from brainshift_ros.surface.surface import Surface
 
 #: How far past a sheet's edge the centre of a mesh face may lie and still be cut, metres.
 EDGE_TOLERANCE_M = 0.001
@@ -48,12 +48,6 @@ class SplitMesh:
     elements: NDArray[np.int32]
     facets: Mapping[str, NDArray[np.int32]]
     rims: Mapping[str, NDArray[np.int32]]
-
-
-def sheet_surfaces(septa: Sequence[Septum]) -> dict[str, Surface]:
-    """One surface a name: left and right tentorium become one roof."""
-    names = list(dict.fromkeys(septum.name for septum in septa))
-    return {name: merged([s.surface for s in septa if s.name == name]) for name in names}
 
 
 def split_along_septa(

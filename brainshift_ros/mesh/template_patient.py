@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from brainshift_ros.image.template import template_labels, template_landmarks, template_t1
 from brainshift_ros.image.tumor import TumorShape, draw_tumor
 from brainshift_ros.image.volume import Volume
-from brainshift_ros.mesh.septa_template import septa_from_template
-from brainshift_ros.mesh.sheets import Septum
+from brainshift_ros.septa.sheets import Septum
+from brainshift_ros.septa.template import septa_from_template
 
 
 @dataclass(frozen=True)

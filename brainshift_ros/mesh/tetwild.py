@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.mesh.sizing import SizeField
-from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import m_to_mm, mm_to_m
 from brainshift_ros.worker_process import WorkerResult, run_worker
 

@@ -11,8 +11,8 @@ from scipy import ndimage
 from brainshift_ros.errors import InputError
 from brainshift_ros.image.labels import voxel_volume
 from brainshift_ros.image.volume import Region, Volume
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.mesh.surfacing import smooth_taubin, surface_of_mask
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import smooth_taubin, surface_of_mask
 from brainshift_ros.units import m3_to_ml
 
 #: A piece of tumour below this volume, a ball of 6 mm, is taken as healthy tissue, with a warning.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from brainshift_ros.mesh.facets import face_table
 from brainshift_ros.mesh.quality import dihedral_angles_deg
 from brainshift_ros.mesh.tetmesh import tetrahedron_volumes
+from brainshift_ros.surface.facets import face_table
 
 _ROUNDS = 6
 

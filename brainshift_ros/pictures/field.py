@@ -12,13 +12,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
-from brainshift_ros.field.grid import Grid
 from brainshift_ros.files import atomic_path
 from brainshift_ros.geometry import unit
+from brainshift_ros.image.grid import Grid
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.inverse.accuracy import shift_correction_percent
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.pictures.slices import CONVENTION, grey_window, three_slices
+from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import m_to_mm
 
 _MEASURED, _PREDICTED, _OUTLIER = "black", "magenta", "tab:orange"

@@ -25,8 +25,8 @@ from brainshift_ros.image.resample import sample
 from brainshift_ros.image.volume import Region, Volume
 from brainshift_ros.mesh.patient import PatientModel, Tissue
 from brainshift_ros.mesh.quality import LIMITS, dihedral_angles_deg
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.mesh.surfacing import polydata
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import polydata
 from brainshift_ros.units import m_to_mm, mm_to_m
 
 SEPTA_COLOURS = {"falx": "#ff9d00", "tentorium": "#e5006d"}
@@ -226,4 +226,5 @@ def _write_figures(axes: Axes, patient: PatientModel) -> None:
     axes.set_axis_off()
     lines = [f"{name:34} {value:10.4g}" for name, value in patient.quality.items()]
     text = "\n".join([patient.image.name, "", *lines, "", *(fill(f"! {warning}", 46) for warning in patient.warnings)])
-    axes.text(0.0, 1.0, text, va="top", family="monospace", fontsize=8.5, transform=axes.transAxes)
+    written = axes.text(0.0, 1.0, text, va="top", family="monospace", fontsize=7.0, transform=axes.transAxes)
+    written.set_in_layout(False)  # a long list must not make the pictures small

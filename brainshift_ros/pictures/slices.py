@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 
-from brainshift_ros.field.grid import Grid, trilinear
+from brainshift_ros.image.grid import Grid, trilinear
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.units import m_to_mm, mm_to_m
 

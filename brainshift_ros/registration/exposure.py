@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainshift_ros.geometry import tangent_frame
-from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.surface.surface import Surface
 
 _CELL_M = 1.2e-3  # of the height maps
 _GRAZING = 0.1  # cosine between direction and normal below which a point counts as hidden

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import tangent_frame, transform_points
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.registration.checks import check_scan
 from brainshift_ros.registration.icp import IcpFit, robust_icp, tukey_weight
 from brainshift_ros.registration.opening import opening_mask
@@ -19,6 +18,7 @@ from brainshift_ros.registration.scan import OrganisedScan
 from brainshift_ros.registration.target import CortexTarget, prepare_target
 from brainshift_ros.registration.thinning import voxel_means
 from brainshift_ros.registration.verdict import Evidence, Gates, judge, plane_residuals, skew
+from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import m_to_mm, mm_to_m
 
 

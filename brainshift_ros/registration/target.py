@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.mesh.surface import Surface
 from brainshift_ros.registration.exposure import open_fraction
 from brainshift_ros.registration.thinning import voxel_means
+from brainshift_ros.surface.surface import Surface
 
 _SPACING_M = 1.2e-3
 _OPEN_FRACTION = 0.12

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from skimage.filters import threshold_otsu
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.field.grid import Grid
+from brainshift_ros.image.grid import Grid
 from brainshift_ros.image.labels import largest_component
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.units import mm_to_m

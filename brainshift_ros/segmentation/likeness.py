@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from brainshift_ros.field.grid import Grid
+from brainshift_ros.image.grid import Grid
 from brainshift_ros.image.resample import sample
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.segmentation.working_images import WorkingImages

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brainshift_ros.field.grid import Grid
-from brainshift_ros.field.itk import read_displacement_image
 from brainshift_ros.geometry import transform_points
+from brainshift_ros.image.grid import Grid
 from brainshift_ros.image.io import write_volume
+from brainshift_ros.image.itk import read_displacement_image
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.segmentation.greedy import run_greedy
 from brainshift_ros.segmentation.initial import brain_centres

@@ -10,8 +10,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from brainshift_ros.field.grid import Grid, reached
 from brainshift_ros.geometry import transform_points
+from brainshift_ros.image.grid import Grid, reached
 from brainshift_ros.image.labels import add_tumor
 from brainshift_ros.image.template import template_labels, template_landmarks, template_t1
 from brainshift_ros.image.volume import Volume

@@ -23,7 +23,7 @@ class SegmentationSettings:
     threads
         Of the registration.
     seed
-        Of its random starts; equal seeds give equal results on one machine.
+        Of its random starts. Threads add up in an order of their own, so equal seeds give nearly equal maps.
     timeout_s
         Wall time after which a stage of the registration is given up.
     """

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainshift_ros.field.grid import Grid, trilinear
 from brainshift_ros.geometry import invert_rigid, transform_points
+from brainshift_ros.image.grid import Grid, trilinear
 
 #: An inverse is refined until it moves by less: a hundredth of a millimetre is far below any voxel.
 TOLERANCE_M = 1e-5

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from brainshift_ros.field.grid import Grid
+from brainshift_ros.image.grid import Grid
 from brainshift_ros.image.resample import resample
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.units import mm_to_m

@@ -10,9 +10,9 @@ from scipy import ndimage
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import tangent_frame, transform_points, unit
-from brainshift_ros.mesh.queries import RayCaster
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.mesh.surfacing import vertex_normals
+from brainshift_ros.surface.queries import RayCaster
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import vertex_normals
 
 _HULL_SPACING_M = 1.5e-3
 _HULL_CLOSING_M = 15e-3

@@ -13,9 +13,6 @@ from scipy.spatial.transform import Rotation
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import invert_rigid, transform_points, unit
 from brainshift_ros.graph import TRACKER_FRAME
-from brainshift_ros.mesh.queries import RayCaster, RayHits
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.mesh.surfacing import vertex_normals
 from brainshift_ros.registration.scan import OrganisedScan
 from brainshift_ros.simulation.craniotomy import (
     Craniotomy,
@@ -26,6 +23,9 @@ from brainshift_ros.simulation.craniotomy import (
 )
 from brainshift_ros.simulation.texture import CortexTexture, paint_texture, smooth_noise
 from brainshift_ros.simulation.vessels import PaintedVessel, grow_vessels
+from brainshift_ros.surface.queries import RayCaster, RayHits
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import vertex_normals
 
 Displacement = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 

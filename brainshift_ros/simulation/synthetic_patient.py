@@ -18,12 +18,12 @@ from brainshift_ros.geometry import rigid, transform_points, unit
 from brainshift_ros.image.template import template_labels, template_landmarks, template_t1
 from brainshift_ros.image.tumor import TumorShape
 from brainshift_ros.image.volume import Region, Volume
-from brainshift_ros.mesh.sheets import Septum, septa_from_landmarks
-from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.septa.sheets import Septum, septa_from_landmarks
 from brainshift_ros.simulation.synthetic_carry import carried
 from brainshift_ros.simulation.synthetic_head import whole_head as draw_head
 from brainshift_ros.simulation.synthetic_mr import imaged, random_contrast, with_tumor
 from brainshift_ros.simulation.synthetic_warp import SyntheticWarp, random_warp
+from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import m_to_mm, mm_to_m
 
 #: Voxels of 1 mm added to the template's grid at the low and the high end of each axis, for the head and the warp.

@@ -14,13 +14,13 @@ from brainshift_ros.errors import InputError
 from brainshift_ros.files import atomic_path, existing_file, writable_target
 from brainshift_ros.image.landmarks import SeptaLandmarks, read_septa_landmarks
 from brainshift_ros.image.volume import Volume
-from brainshift_ros.mesh.facets import compact
-from brainshift_ros.mesh.septa_frame import check_frame
-from brainshift_ros.mesh.septa_sketch import septa_from_sketch
-from brainshift_ros.mesh.septa_strip import with_strips
-from brainshift_ros.mesh.sheets import Septum, SeptumName, septa_from_landmarks
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.mesh.surfacing import vertex_normals
+from brainshift_ros.septa.frame import check_frame
+from brainshift_ros.septa.sheets import Septum, SeptumName, septa_from_landmarks
+from brainshift_ros.septa.sketch import septa_from_sketch
+from brainshift_ros.septa.strip import with_strips
+from brainshift_ros.surface.facets import compact
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import vertex_normals
 from brainshift_ros.units import m_to_mm, mm_to_m
 
 MESH_SUFFIXES = (".vtu", ".vtk")

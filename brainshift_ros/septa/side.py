@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pyvista as pv
 from numpy.typing import NDArray
 
-from brainshift_ros.mesh.queries import closest_points
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.mesh.surfacing import polydata, vertex_normals
+from brainshift_ros.surface.queries import closest_points
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import vertex_normals
 
 
 @dataclass(frozen=True)
@@ -49,13 +48,6 @@ def side_of_sheet(sheet: Surface, points: NDArray[np.float64]) -> SideOfSheet:
     past = np.all(at_edge | (weights < 1e-3), axis=1)
     overshoot = np.where(past, np.sqrt(np.maximum(np.einsum("nk,nk->n", offset, offset) - height**2, 0.0)), 0.0)
     return SideOfSheet(height, overshoot, found.position)
-
-
-def merged(sheets: list[Surface]) -> Surface:
-    """Join sheets into one, with vertices at the same place made one, so that they meet without an edge between."""
-    poly = pv.merge([polydata(s) for s in sheets], merge_points=False)
-    poly = poly.extract_surface(algorithm=None).clean(tolerance=1e-7, absolute=True)
-    return Surface(np.asarray(poly.points, dtype=np.float64), np.asarray(poly.regular_faces, dtype=np.int32))
 
 
 def _on_edge(sheet: Surface) -> NDArray[np.bool_]:

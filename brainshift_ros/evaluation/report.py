@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from brainshift_ros.errors import InputError
+from brainshift_ros.evaluation.overlap import RegionAgreement, region_agreement
+from brainshift_ros.evaluation.septa_distance import SheetDistance, septa_distances
+from brainshift_ros.evaluation.slice_errors import VISIBLE_MM, SliceErrors, slice_errors
 from brainshift_ros.image.resample import resample
 from brainshift_ros.image.volume import Volume
-from brainshift_ros.mesh.sheets import Septum
-from brainshift_ros.segmentation.overlap import RegionAgreement, region_agreement
-from brainshift_ros.segmentation.septa_distance import SheetDistance, septa_distances
-from brainshift_ros.segmentation.slice_errors import VISIBLE_MM, SliceErrors, slice_errors
+from brainshift_ros.septa.sheets import Septum
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from skimage.measure import marching_cubes
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import transform_points, unit
-from brainshift_ros.mesh.facets import facet_areas
-from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.surface.facets import facet_areas
+from brainshift_ros.surface.surface import Surface
 
 
 def surface_of_mask(mask: NDArray[np.bool_], T_patient_voxel: NDArray[np.float64], blur: float = 0.0) -> Surface:
@@ -77,6 +77,13 @@ def enclosed_volume(surface: Surface) -> float:
 def face_areas(surface: Surface) -> NDArray[np.float64]:
     """Area of each face, m^2."""
     return facet_areas(surface.vertices, surface.faces)
+
+
+def merged(sheets: list[Surface]) -> Surface:
+    """Join sheets into one, with vertices at the same place made one, so that they meet without an edge between."""
+    poly = pv.merge([polydata(s) for s in sheets], merge_points=False)
+    poly = poly.extract_surface(algorithm=None).clean(tolerance=1e-7, absolute=True)
+    return Surface(np.asarray(poly.points, dtype=np.float64), np.asarray(poly.regular_faces, dtype=np.int32))
 
 
 def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:

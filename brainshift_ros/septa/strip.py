@@ -11,8 +11,8 @@ from scipy import ndimage
 from brainshift_ros.geometry import unit
 from brainshift_ros.image.resample import sample
 from brainshift_ros.image.volume import Volume
-from brainshift_ros.mesh.sheets import Septum
-from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.septa.sheets import Septum
+from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import m_to_mm, mm_to_m
 
 #: Width of the strips. A registration may be off by 3 mm, an edge that was drawn on the skull's inner side by 2 mm.

@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from brainshift_ros.evaluation.distances import DistanceFigures, figures_of
 from brainshift_ros.image.labels import cropped
 from brainshift_ros.image.resample import sample
 from brainshift_ros.image.volume import Volume
-from brainshift_ros.mesh.queries import closest_points
-from brainshift_ros.mesh.sheets import Septum
-from brainshift_ros.mesh.side import merged, side_of_sheet
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.segmentation.distances import DistanceFigures, figures_of
+from brainshift_ros.septa.sheets import Septum
+from brainshift_ros.septa.side import side_of_sheet
+from brainshift_ros.surface.queries import closest_points
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import merged
 from brainshift_ros.units import m_to_mm, mm_to_m
 
 #: Gaps of the brain mask narrower than twice this are inside the brain: the fissures in which the septa lie.

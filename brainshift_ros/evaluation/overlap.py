@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from brainshift_ros.evaluation.distances import DistanceFigures, figures_of, surface_distances
 from brainshift_ros.image.labels import voxel_volume
 from brainshift_ros.image.volume import Region, Volume
-from brainshift_ros.segmentation.distances import DistanceFigures, figures_of, surface_distances
 from brainshift_ros.units import m3_to_ml
 
 _REGIONS = tuple(region for region in Region if region != Region.OUTSIDE)

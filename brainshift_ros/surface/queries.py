@@ -9,7 +9,7 @@ import numpy as np
 from igl.embree import EmbreeIntersector
 from numpy.typing import ArrayLike, NDArray
 
-from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.surface.surface import Surface
 
 
 @dataclass(frozen=True)

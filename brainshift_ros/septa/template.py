@@ -12,9 +12,9 @@ from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import unit
 from brainshift_ros.image.template import template_labels, template_landmarks
 from brainshift_ros.image.volume import Volume
-from brainshift_ros.mesh.septa_strip import STRIP_MM, blurred_brain, out_of_brain, with_strip
-from brainshift_ros.mesh.sheets import Septum, septa_from_landmarks
-from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.septa.sheets import Septum, septa_from_landmarks
+from brainshift_ros.septa.strip import STRIP_MM, blurred_brain, out_of_brain, with_strip
+from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import mm_to_m
 
 #: How far from the attached edge into the brain a map is asked for the direction in which it goes on outside.

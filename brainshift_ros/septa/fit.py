@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.mesh.queries import closest_points, inside
-from brainshift_ros.mesh.sheets import Septum
-from brainshift_ros.mesh.split import sheet_surfaces
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.mesh.surfacing import face_areas
+from brainshift_ros.septa.sheets import Septum, sheet_surfaces
+from brainshift_ros.surface.queries import closest_points, inside
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import face_areas
 from brainshift_ros.units import m_to_mm
 
 #: Share of a sheet's area inside the brain. On the template it is 0.83 (falx) and 0.92 (tentorium); with landmarks in LPS

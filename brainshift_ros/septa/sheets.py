@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -14,7 +15,8 @@ from scipy.spatial import Delaunay
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import tangent_frame
 from brainshift_ros.image.landmarks import SeptaLandmarks
-from brainshift_ros.mesh.surface import Surface
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import merged
 from brainshift_ros.units import mm_to_m
 
 SeptumName = Literal["falx", "tentorium"]
@@ -42,6 +44,12 @@ class Septum:
     name: SeptumName
     surface: Surface
     attached: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, dtype=np.int32))
+
+
+def sheet_surfaces(septa: Sequence[Septum]) -> dict[str, Surface]:
+    """One surface a name: left and right tentorium become one roof."""
+    names = list(dict.fromkeys(septum.name for septum in septa))
+    return {name: merged([s.surface for s in septa if s.name == name]) for name in names}
 
 
 def septa_spacing_mm(nodes: int) -> float:

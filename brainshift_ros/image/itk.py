@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.field.grid import Grid
 from brainshift_ros.files import atomic_path, existing_file, writable_target
 from brainshift_ros.geometry import T_LPS_RAS
+from brainshift_ros.image.grid import Grid
 from brainshift_ros.image.io import NIFTI_SUFFIXES
 from brainshift_ros.units import affine_m_to_mm, affine_mm_to_m, m_to_mm, mm_to_m
 

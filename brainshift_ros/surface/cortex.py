@@ -9,9 +9,9 @@ from skimage.filters import threshold_multiotsu
 
 from brainshift_ros.image.labels import largest_component
 from brainshift_ros.image.volume import Region, Volume
-from brainshift_ros.mesh.facets import compact, components
-from brainshift_ros.mesh.surface import Surface
-from brainshift_ros.mesh.surfacing import decimate, face_areas, isosurface, smooth_taubin
+from brainshift_ros.surface.facets import compact, components
+from brainshift_ros.surface.surface import Surface
+from brainshift_ros.surface.surfacing import decimate, face_areas, isosurface, smooth_taubin
 from brainshift_ros.units import m_to_mm
 
 #: Grooves narrower than twice this are bridged, as the arachnoid does.

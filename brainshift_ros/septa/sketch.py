@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline, RBFInterpolator
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import tangent_frame
 from brainshift_ros.image.landmarks import Plane, SeptaSketch, TentoriumSketch
-from brainshift_ros.mesh.sheets import Septum, resampled, septum_inside
+from brainshift_ros.septa.sheets import Septum, resampled, septum_inside
 
 #: Points drawn on the mid-sagittal slice lie on it, but for rounding and a slice's thickness.
 _OFF_SLICE_MM = 10.0

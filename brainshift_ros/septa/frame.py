@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.mesh.sheets import Septum
-from brainshift_ros.mesh.surfacing import face_areas
+from brainshift_ros.septa.sheets import Septum
+from brainshift_ros.surface.surfacing import face_areas
 from brainshift_ros.units import m_to_mm
 
 #: A head's falx measures 130 to 250 mm from end to end, each tentorium 60 to 150 mm; these leave room to children and to

@@ -1,0 +1,1 @@
+"""Dural septa as triangle sheets: from the template, from a person, from files; their fit to a brain."""

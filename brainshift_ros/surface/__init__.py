@@ -1,0 +1,1 @@
+"""Triangle surfaces: extraction, smoothing, closest points, inside tests, rays; the cortex."""
