@@ -79,7 +79,8 @@ def test_run_starts_the_graph_and_ends_it_cleanly_on_sigterm(files):
     process = subprocess.Popen(
         [*BRAINSHIFT, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=ros_environment(21)
     )
-    goals = ("--until", "diagnostics:8", "--until", "atlas/info")
+    # Enough heartbeats that each of the four nodes has spoken, in whatever order they are discovered.
+    goals = ("--until", "diagnostics:40", "--until", "atlas/info")
     listed = tool("record", str(files / "heard.mcap"), *goals, "--timeout", "60", domain=21)
     process.send_signal(signal.SIGTERM)
     output, _ = process.communicate(timeout=30)
