@@ -1,4 +1,4 @@
-"""Run by an interpreter that has antspyx: rigid, affine and SyN of the images in a folder. Imports nothing of the project."""
+"""Run by an interpreter that has antspyx: its own SyN (mutual information) of the images in a folder. No project imports."""
 
 from __future__ import annotations
 
@@ -23,9 +23,6 @@ def main(folder: Path, threads: str) -> None:
         mask=fixed_mask,
         moving_mask=known,
         mask_all_stages=True,
-        syn_metric="CC",
-        syn_sampling=2,
-        reg_iterations=(100, 50, 20),
         random_seed=1,
     )
     for path in result["fwdtransforms"]:
