@@ -26,6 +26,7 @@ test: lint
 	$(BIN)/python -m pytest -m "not slow"
 
 bench: setup
+	@python3 scripts/bootstrap.py --peers
 	$(BIN)/python -m bench --output out/bench
 
 clean:

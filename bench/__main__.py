@@ -11,12 +11,19 @@ from rich.console import Console
 from rich.table import Table
 
 from bench import atlas, inverse
+from bench.peers import slip
+from brainshift_ros.atlas.build import build_atlas
+from brainshift_ros.atlas.columns import entries_of
 from brainshift_ros.atlas.scene import read_scene
 from brainshift_ros.demo.preparation import make_images, make_patients
 from brainshift_ros.demo.settings import DemoFiles, DemoSettings
 from brainshift_ros.files import atomic_path
-from brainshift_ros.mechanics.solvers import resolve
+from brainshift_ros.mechanics.skull import SkullName
 from brainshift_ros.resources import resource
+from brainshift_ros.solvers.direct import SolverName
+
+#: Both models of the skull are compared with refactoring.
+SKULL_MODELS: tuple[SkullName, ...] = ("free_cap", "contact")
 
 
 def show(console: Console, title: str, rows: list[dict[str, Any]]) -> None:
@@ -30,8 +37,8 @@ def show(console: Console, title: str, rows: list[dict[str, Any]]) -> None:
 
 @click.command()
 @click.option("--output", type=click.Path(path_type=Path), default=Path("out/bench"), show_default=True)
-@click.option("--scipy", "with_scipy", is_flag=True, help="also build with SciPy's own solver (slow)")
-def main(output: Path, with_scipy: bool) -> None:
+@click.option("--solver", type=click.Choice(["auto", "pardiso", "scipy"]), default="auto", show_default=True)
+def main(output: Path, solver: SolverName) -> None:
     """Measure speed beside accuracy on the demo's patient (made in out/demo if it is not there)."""
     console = Console()
     output.mkdir(parents=True, exist_ok=True)
@@ -41,15 +48,33 @@ def main(output: Path, with_scipy: bool) -> None:
     with console.status("patient"):
         images = make_images(settings, files)
         patient, _, _ = make_patients(settings, files, images, lambda _stage, _fraction: None)
-    scene = read_scene(resource("config/scene_demo.yaml"))
-    fastest = resolve("auto")
-    solvers = (fastest, "scipy") if with_scipy and fastest != "scipy" else (fastest,)
+    full, demo = resource("config/scene_full.yaml"), resource("config/scene_demo.yaml")
+    scene = read_scene(full)
     results: dict[str, list[dict[str, Any]]] = {}
-    with console.status("atlas"):
-        results["atlas"] = atlas.run(scene, patient, output, solvers)
-    show(console, f"atlas of {len(patient.mesh.nodes)} nodes", results["atlas"])
+    with console.status(f"atlas of {len(entries_of(scene))} entries"):
+        results["atlas"] = [atlas.build(files.patient, full, output)]
+    show(console, f"the whole atlas of {len(patient.mesh.nodes)} nodes", results["atlas"])
+    with console.status("file"):
+        results["file"] = atlas.read(output / "atlas.h5")
+    show(console, "reading it", results["file"])
+    with console.status("one factorisation a boundary-condition set"):
+        results["refactoring"] = [
+            row for skull in SKULL_MODELS for row in atlas.against_refactoring(patient, scene, skull, solver)
+        ]
+    show(
+        console,
+        "one factorisation a boundary-condition set, and how far the atlas's solution is from it",
+        results["refactoring"],
+    )
+    with console.status("NGSolve"):
+        results["ngsolve"] = atlas.against_ngsolve(patient, scene)
+    show(console, "one boundary-condition set by NGSolve", results["ngsolve"])
+    with console.status("NGSolve, slip problem"):
+        results["ngsolve_slip"] = [slip.compare(order) for order in (1, 2)]
+    show(console, "the whole chain by NGSolve: a bar with slip walls", results["ngsolve_slip"])
     with console.status("inverse"):
-        results["inverse"] = inverse.run(output / f"atlas_{fastest}.h5", patient)
+        build_atlas(patient, read_scene(demo), output / "atlas_demo.h5")
+        results["inverse"] = inverse.run(output / "atlas_demo.h5", patient)
     title = f"inverse from {inverse.POINTS} points, noise {1e3 * inverse.NOISE_M} mm; truth on the atlas's own mesh"
     show(console, title, results["inverse"])
     with atomic_path(output / "bench.json") as temporary:

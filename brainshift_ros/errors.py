@@ -28,3 +28,7 @@ class InputError(ValueError):
         self.problem = problem
         self.remedy = remedy
         super().__init__(f"{self.source}: {problem}; {remedy}")
+
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        """Pickle by the three parts, so that the error crosses from a worker process."""
+        return type(self), (self.source, self.problem, self.remedy)

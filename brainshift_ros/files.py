@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import os
 from collections.abc import Iterator
@@ -45,6 +46,13 @@ def atomic_path(target: str | Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, target)
     finally:
+        temporary.unlink(missing_ok=True)
+
+
+def remove_unfinished(target: str | Path) -> None:
+    """Remove what writers of `target` left that were killed in :func:`atomic_path`; only where none can be alive."""
+    target = Path(target)
+    for temporary in target.parent.glob(f".part-*-{glob.escape(target.name)}"):
         temporary.unlink(missing_ok=True)
 
 

@@ -1,4 +1,4 @@
-"""Make .venv with the pinned packages, and say clearly what the machine lacks.
+"""Make .venv with the pinned packages, and say clearly what the machine lacks; with --peers also .venv/peers, for `make bench`.
 
 Runs under the system's python3, whatever its age: plain syntax, standard library only.
 """
@@ -15,6 +15,7 @@ VENV = os.path.join(HERE, ".venv")
 VENV_PYTHON = os.path.join(VENV, "bin", "python")
 STAMP = os.path.join(VENV, ".ready")
 LOCK = "requirements/lock.txt"
+PEERS, PEERS_LOCK = os.path.join(VENV, "peers"), "requirements/peers.txt"
 DECIDING = [LOCK, "setup.py", "setup.cfg", "pyproject.toml", "scripts/bootstrap.py"]
 
 
@@ -56,6 +57,24 @@ def run(command, problem, remedy="see the lines above"):
         fail(problem, remedy)
 
 
+def set_up_peers():
+    """Make .venv/peers unless it is already as wanted; a bench without it says what it leaves out."""
+    stamp = os.path.join(PEERS, ".ready")
+    with open(os.path.join(HERE, PEERS_LOCK)) as stream:
+        wanted = stream.read()
+    if os.path.exists(stamp):
+        with open(stamp) as stream:
+            if stream.read() == wanted:
+                return
+    print("Setting up .venv/peers (packages are downloaded once) ...", flush=True)
+    run([VENV_PYTHON, "-m", "venv", "--clear", PEERS], "the environment of the peers could not be made")
+    python = os.path.join(PEERS, "bin", "python")
+    install = [python, "-m", "pip", "--disable-pip-version-check", "install", "--quiet", "--no-deps", "-r", PEERS_LOCK]
+    run(install, "pip could not install the peers")
+    with open(stamp, "w") as stream:
+        stream.write(wanted)
+
+
 def main():
     """Set up .venv unless it is already as wanted."""
     wanted = fingerprint()
@@ -86,3 +105,5 @@ def main():
 
 if __name__ == "__main__":
     main()
+    if "--peers" in sys.argv[1:]:
+        set_up_peers()

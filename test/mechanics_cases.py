@@ -6,6 +6,7 @@ import numpy as np
 from skfem import MeshTet
 
 from brainshift_ros.image.volume import Region
+from brainshift_ros.mechanics.materials import material_of
 from brainshift_ros.mesh.patient import ImageReference, PatientModel, Tissue
 from brainshift_ros.mesh.tetmesh import TetMesh
 from brainshift_ros.surface.facets import LOCAL_FACES
@@ -51,9 +52,10 @@ def ids(mask):
     return np.flatnonzero(mask).astype(np.int32)
 
 
-def column(n, height=0.1, width=0.03):
+def column(n, height=0.1, width=0.03, across=None):
     """A bar on the ground: base fixed, sides slip (named falx and tentorium), top free (skull in the cap)."""
-    nodes, elements = box((n // 3, n // 3, n), (width, width, height))
+    across = n // 3 if across is None else across
+    nodes, elements = box((across, across, n), (width, width, height))
     outer = outer_facets(elements)
     on = lambda axis, value: facets_where(nodes, outer, lambda x: np.isclose(x[..., axis], value))  # noqa: E731
     facets = {
@@ -111,3 +113,8 @@ def patient(mesh, name="test"):
     tissue = np.where(mesh.region == Region.TUMOR, Tissue.TUMOR, Tissue.WHITE).astype(np.uint8)
     image = ImageReference(name, "0" * 64, (1, 1, 1), np.eye(4))
     return PatientModel(mesh, tissue, Surface(mesh.nodes, mesh.facets["skull"]), image, {}, (), "ab" * 32)
+
+
+def brain(mesh):
+    """Table 1 on a mesh: white matter and tumour."""
+    return material_of(np.where(mesh.region == Region.TUMOR, Tissue.TUMOR, Tissue.WHITE).astype(np.uint8))

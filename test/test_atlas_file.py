@@ -17,15 +17,28 @@ from hypothesis import strategies as st
 from mechanics_cases import head, patient
 
 from brainshift_ros.atlas.columns import entries_of, groups_of
-from brainshift_ros.atlas.file import AtlasContent, open_atlas, write_atlas
-from brainshift_ros.atlas.scene import Gravity, Scene
+from brainshift_ros.atlas.diagnostics import DIAGNOSTICS
+from brainshift_ros.atlas.file import BLOCK_NODES, AtlasContent, open_atlas, write_atlas
+from brainshift_ros.atlas.scene import Gravity, Mannitol, Scene, Swelling
 from brainshift_ros.errors import InputError
+from brainshift_ros.mechanics.materials import TABLE_1
 
-# 70 columns: more than one block of checksums.
-SCENE = Scene(gravity=Gravity(direction=(0.0, 0.0, -1.0), orientations=35, fluid_levels=1), resection="both")
+SCENE = Scene(
+    gravity=Gravity(direction=(0.0, 0.0, -1.0), orientations=7, fluid_levels=2),
+    mannitol=Mannitol(permeability_levels=2),
+    swelling=Swelling(pressure_levels=1),
+    resection="both",
+)
 ENTRIES = entries_of(SCENE)
-PATIENT = patient(head(4))
-CONTENT = AtlasContent(PATIENT.patient_id, PATIENT.mesh, PATIENT.tissue, SCENE, ENTRIES, groups_of(ENTRIES))
+PATIENT = patient(head(10))  # more nodes than one block of checksums
+DIAGNOSED = np.zeros(len(ENTRIES), dtype=DIAGNOSTICS)
+DIAGNOSED["smallest_det_f"] = np.linspace(-0.1, 0.9, len(ENTRIES))
+DIAGNOSED["inverted_elements"] = DIAGNOSED["smallest_det_f"] < 0.0
+CONTENT = AtlasContent(
+    *(PATIENT.patient_id, PATIENT.mesh, PATIENT.tissue, SCENE, ENTRIES, groups_of(ENTRIES)),
+    diagnostics=DIAGNOSED,
+    solver="pardiso",
+)
 E = np.random.default_rng(0).normal(size=(len(PATIENT.mesh.nodes), 3, len(ENTRIES))).astype(np.float32)
 
 
@@ -48,7 +61,11 @@ def copy(atlas_path, tmp_path):
 
 
 def test_everything_comes_back(atlas):
+    assert len(PATIENT.mesh.nodes) > BLOCK_NODES
     assert atlas.entries == ENTRIES
+    assert dict(atlas.materials) == dict(TABLE_1)
+    assert atlas.solver == "pardiso"
+    np.testing.assert_array_equal(atlas.diagnostics, DIAGNOSED)
     assert atlas.groups == CONTENT.groups
     assert atlas.scene == SCENE
     assert atlas.patient_id == PATIENT.patient_id
@@ -80,17 +97,37 @@ def test_info_satisfies_its_published_schema(atlas, atlas_path):
     info = json.loads(json.dumps(atlas.info()))
     jsonschema.validate(info, schema)
     assert info["entries"] == 70
-    assert info["mechanisms"] == ["gravity"]
+    assert info["mechanisms"] == ["gravity", "mannitol", "swelling"]
     assert info["path"] == str(atlas_path)
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate({**info, "atlas_id": "none"}, schema)
 
 
+def test_table_says_what_the_levels_stand_for(atlas_path):
+    # Table 1: k_c from 11.5e-9 to 34.5e-9 1/(Pa s) in grey matter, p_c -3633 Pa.
+    with h5py.File(atlas_path) as file:
+        table = file["entries"][()]
+    kinds = [
+        (b"gravity", 0.0, 11.5e-9, 2.3e-9),
+        (b"mannitol", -3633.0, 11.5e-9, 2.3e-9),
+        (b"mannitol", -3633.0, 34.5e-9, 6.9e-9),
+        (b"swelling", 3633.0, 11.5e-9, 2.3e-9),
+    ]
+    found = {
+        (row["mechanism"], row["capillary_pressure"], round(row["exchange_grey"], 12), round(row["exchange_white"], 12))
+        for row in table
+    }
+    assert found == set(kinds)
+
+
 def test_id_depends_on_content_alone(tmp_path, atlas):
     path = tmp_path / "again.h5"
     assert write_atlas(path, CONTENT, E) == atlas.atlas_id
+    assert write_atlas(path, dataclasses.replace(CONTENT, diagnostics=None, solver="scipy"), E) == atlas.atlas_id
+    with open_atlas(path) as undiagnosed:
+        assert undiagnosed.diagnostics is None
     changed = E.copy()
-    changed[3, 1, 69] += 1e-3
+    changed[3, 1, 9] += 1e-3
     ids = {
         atlas.atlas_id,
         write_atlas(path, CONTENT, changed),
@@ -128,7 +165,7 @@ def damage(name):
         if name == "version":
             file.attrs["version"] = 99
         elif name == "one value":
-            file["E"][5, 2, 65] += np.float32(1e-4)
+            file["E"][1030, 2, 65] += np.float32(1e-4)
         elif name == "nodes":
             file["mesh/nodes"][0, 0] += 1e-6
         elif name == "tissue":
@@ -154,6 +191,12 @@ def damage(name):
         elif name == "no checksums":
             del file["E_sha256"]
             file["E_sha256"] = np.zeros(0, "S64")
+        elif name == "diagnostics":
+            table = file["diagnostics"][()]
+            table["residual"][3] = 1e-16
+            file["diagnostics"][...] = table
+        elif name == "older version":
+            file.attrs["version"] = 1
         elif name == "no id":
             del file.attrs["atlas_id"]
 
@@ -164,7 +207,7 @@ def damage(name):
     ("fault", "words"),
     [
         ("version", "format version 99"),
-        ("one value", "columns 64 to 69 .* do not match their checksum"),
+        ("one value", "rows of nodes 1024 to .* do not match their checksum"),
         ("nodes", "mesh does not match its checksum"),
         ("tissue", "does not match its id"),
         ("scene", "does not match its id"),
@@ -175,6 +218,8 @@ def damage(name):
         ("fewer entries", "mesh and entries need"),
         ("no matrix", "cannot be read"),
         ("no checksums", "checksums of its matrix are missing"),
+        ("diagnostics", "diagnostics do not match their checksum"),
+        ("older version", "format version 1, this software reads 2; make the atlas file again"),
         ("no id", "cannot be read"),
     ],
 )
@@ -193,6 +238,8 @@ def test_matrix_that_does_not_fit_is_not_written(tmp_path):
     for wrong in (E[:-1], E.astype(np.float64), np.where(E[0, 0, 0] == E, np.float32(np.nan), E)):
         with pytest.raises(ValueError):
             write_atlas(path, CONTENT, wrong)
+    with pytest.raises(ValueError, match="diagnostics"):
+        write_atlas(path, dataclasses.replace(CONTENT, diagnostics=DIAGNOSED[:-1]), E)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from mechanics_cases import box, column, head, ids, outer_facets, plain, split_box
+from mechanics_cases import box, brain, column, head, ids, outer_facets, plain, split_box
 from scipy.spatial.transform import Rotation
 
 from brainshift_ros.errors import InputError
@@ -14,17 +14,12 @@ from brainshift_ros.image.volume import Region
 from brainshift_ros.mechanics.boundary import NodeKind
 from brainshift_ros.mechanics.extension import harmonic_extension
 from brainshift_ros.mechanics.forward import solve_gravity
-from brainshift_ros.mechanics.materials import GRAVITY, Material, material_of
-from brainshift_ros.mesh.patient import Tissue
+from brainshift_ros.mechanics.materials import GRAVITY, Material
 from brainshift_ros.mesh.tetmesh import TetMesh
 
 DOWN = np.array([0.0, 0.0, -1.0])
 OBLIQUE = np.array([0.1, -0.5, -0.8])
 HEIGHT = 0.1
-
-
-def brain(mesh):
-    return material_of(np.where(mesh.region == Region.TUMOR, Tissue.TUMOR, Tissue.WHITE).astype(np.uint8))
 
 
 def column_error(n, level):

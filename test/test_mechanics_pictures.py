@@ -8,14 +8,17 @@ from matplotlib.figure import Figure
 from mechanics_cases import head
 
 from brainshift_ros.mechanics.boundary import boundary_of, in_cap, node_kinds
-from brainshift_ros.pictures.boundary import boundary_figure, draw_facets
+from brainshift_ros.mechanics.space import space_of
+from brainshift_ros.pictures.boundary import BoundaryCase, boundary_figure, draw_facets
 
 
 def test_the_cap_is_red_on_top_and_the_brainstem_blue():
     mesh = head(8)
-    boundary = boundary_of(mesh)
+    boundary = boundary_of(space_of(mesh))
     kinds = [node_kinds(boundary, in_cap(mesh.nodes, down, 0.8)) for down in ([0.0, 0.0, -1.0], [0.0, -1.0, 0.0])]
-    figure = boundary_figure(mesh, [("upright", kinds[0]), ("supine", kinds[1])])
+    drained = {"low": np.ones(len(mesh.nodes), bool)}
+    cases = [BoundaryCase(name, of, drained) for name, of in zip(("upright", "supine"), kinds, strict=True)]
+    figure = boundary_figure(mesh, cases)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     upright, supine = figure.axes[0], figure.axes[1]
@@ -27,7 +30,9 @@ def test_the_cap_is_red_on_top_and_the_brainstem_blue():
     blue = [(face[:, 2] > 1.2 * face[:, 0]) & (face[:, 2] > 1.1 * face[:, 1]) for face in faces]
     assert heights[0][red[0]].mean() > 30.0 > heights[1][red[1]].mean()  # mm up the page
     assert heights[0][blue[0]].mean() < -30.0
-    assert len(figure.legends[0].get_texts()) == 3
+    assert len(figure.legends[0].get_texts()) == 5  # fixed, slip, free; no flux, atmospheric
+    pressure = figure.axes[-1].collections[0].get_facecolor()[:, :3]
+    assert np.all(pressure[:, 1] > pressure[:, 2])  # all of the skull is green: atmospheric
 
 
 def test_near_facets_are_drawn_last():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from brainshift_ros.atlas.orientations import directions_in_cone
+from brainshift_ros.mechanics.boundary import NodeKind
 from brainshift_ros.simulation.targets import MIDLINE_M, target_groups
 from brainshift_ros.simulation.truth import direction_between, simulate_truth, smooth_random_field
 from brainshift_ros.surface.queries import closest_points
@@ -67,3 +68,18 @@ def test_targets_are_where_their_names_say(small_patient):
     falx = Surface(mesh.nodes, mesh.facets["falx"])
     assert closest_points(falx, mesh.nodes[groups["midline"]]).distance.max() <= MIDLINE_M
     assert len(np.intersect1d(groups["subsurface"], groups["deep"])) == 0
+
+
+def test_a_truth_s_cortex_may_cross_the_skull_in_the_opening_only(small_patient):
+    mesh = small_patient.mesh
+    skull = np.unique(mesh.facets["skull"])
+    opening = np.zeros(len(mesh.nodes), dtype=bool)
+    opening[skull[np.linalg.norm(mesh.nodes[skull] - CENTER, axis=1) <= 0.035]] = True
+    free, held = (
+        simulate_truth(small_patient, UP, 0.3, seed=1, skull=model, opening=opening).solution
+        for model in ("free_cap", "contact")
+    )
+    assert (held.kinds == NodeKind.CONTACT).any()
+    assert not (free.kinds == NodeKind.CONTACT).any()
+    assert not (held.kinds[opening] == NodeKind.CONTACT).any()
+    assert not np.allclose(free.displacement, held.displacement, atol=1e-6)

@@ -6,7 +6,7 @@ import numpy as np
 
 from brainshift_ros.atlas.entry import AtlasEntry, WeightGroup
 from brainshift_ros.atlas.orientations import directions_in_cone
-from brainshift_ros.atlas.scene import Scene
+from brainshift_ros.atlas.scene import Scene, orientations_of
 from brainshift_ros.errors import InputError
 
 #: Range of fluid levels, as fractions of the head's extent along up; the thesis designates its levels by hand. On the MNI152
@@ -15,10 +15,23 @@ from brainshift_ros.errors import InputError
 LOWEST_FLUID_LEVEL = 0.4
 HIGHEST_FLUID_LEVEL = 0.8
 
+#: Fluid level of entries on which gravity does not act: nothing lies above it, so nothing has lost its buoyancy.
+SUBMERGED = 1.0
+
 
 def fluid_levels(count: int) -> tuple[float, ...]:
     """Evenly spaced fluid levels from the lowest up."""
     return tuple(float(level) for level in np.linspace(LOWEST_FLUID_LEVEL, HIGHEST_FLUID_LEVEL, count))
+
+
+def permeability_levels(count: int) -> tuple[float, ...]:
+    """Evenly spaced from k_c1 (0) to k_c3 (1) of table 1; the highest alone if there is one, since weights reach down."""
+    return tuple(float(level) for level in np.linspace(0.0, 1.0, count)) if count > 1 else (1.0,)
+
+
+def pressure_levels(count: int) -> tuple[float, ...]:
+    """Evenly spaced fractions of the largest pressure up to it, without zero."""
+    return tuple(float(level) for level in np.arange(1, count + 1) / count)
 
 
 def refuse_unmodelled(scene: Scene, source: object) -> None:
@@ -27,26 +40,17 @@ def refuse_unmodelled(scene: Scene, source: object) -> None:
     Raises
     ------
     InputError
-        Every key of the scene that is not modelled is named.
+        The scene leaves the choice of its model to a tolerance.
     """
-    absent = {
-        "mannitol": scene.mannitol is not None,
-        "swelling": scene.swelling is not None,
-        "model.element: P2": scene.model.element == "P2",
-        "model.time: transient": scene.model.time != "steady",
-        "model.skull: contact": scene.model.skull == "contact",
-        "tolerance_mm": scene.tolerance_mm is not None,
-    }
-    asked = [key for key, is_asked in absent.items() if is_asked]
-    if asked:
-        remedy = "remove these keys: gravity with element P1, time steady and skull free_cap is modelled"
-        raise InputError(source, f"asks for {', '.join(asked)}, which this version does not model", remedy)
-    if scene.gravity is None:
-        raise InputError(source, "names no mechanism", "give gravity")
+    if scene.tolerance_mm is not None:
+        problem = "asks for tolerance_mm, by which this version cannot choose a model"
+        raise InputError(source, problem, "remove it, and say under `model` which element, time and skull to use")
 
 
 def entries_of(scene: Scene, source: object = "scene") -> tuple[AtlasEntry, ...]:
-    """Entries of a scene: resection state by state, orientation by orientation, level by level.
+    """Entries of a scene: by resection state, then orientation, then mechanism, then level.
+
+    All entries of one orientation stand together, since they share their displacement boundary conditions (figure 5).
 
     Parameters
     ----------
@@ -58,24 +62,33 @@ def entries_of(scene: Scene, source: object = "scene") -> tuple[AtlasEntry, ...]
     Raises
     ------
     InputError
-        The scene asks for what this version does not model.
+        The scene asks for what this version does not model, or does not say how the head lies.
     """
     refuse_unmodelled(scene, source)
-    assert scene.gravity is not None
-    gravity = scene.gravity
-    directions = directions_in_cone(gravity.direction, np.radians(gravity.cone_deg), gravity.orientations)
+    head = orientations_of(scene, source)
+    directions = directions_in_cone(head.direction, np.radians(head.cone_deg), head.orientations)
     states = {"none": (False,), "resected": (True,), "both": (False, True)}[scene.resection]
+    mechanisms: list[tuple[str, float, int, float]] = []
+    if scene.gravity is not None:
+        mechanisms += [("gravity", level, 0, 0.0) for level in fluid_levels(scene.gravity.fluid_levels)]
+    if scene.mannitol is not None:
+        levels = permeability_levels(scene.mannitol.permeability_levels)
+        mechanisms += [("mannitol", SUBMERGED, number, intensity) for number, intensity in enumerate(levels, start=1)]
+    if scene.swelling is not None:
+        levels = pressure_levels(scene.swelling.pressure_levels)
+        mechanisms += [("swelling", SUBMERGED, number, intensity) for number, intensity in enumerate(levels, start=1)]
     return tuple(
         AtlasEntry(
-            mechanism="gravity",
+            mechanism=mechanism,
             gravity_direction=(float(direction[0]), float(direction[1]), float(direction[2])),
-            fluid_level=level,
-            drug_level=0,
+            fluid_level=fluid_level,
+            drug_level=drug_level,
             resected=resected,
+            intensity=intensity,
         )
         for resected in states
         for direction in directions
-        for level in fluid_levels(gravity.fluid_levels)
+        for mechanism, fluid_level, drug_level, intensity in mechanisms
     )
 
 

@@ -17,11 +17,14 @@ class AtlasEntry:
         Unit vector along which gravity pulls, patient frame.
     fluid_level
         Height of the fluid surface along "up" (against gravity), as a fraction of the head's extent, 0 at the lowest
-        and 1 at the highest node; tissue above it has lost its buoyancy.
+        and 1 at the highest node; tissue above it has lost its buoyancy. 1 where gravity does not act.
     drug_level
         1-based level of the drug or of the swelling pressure, 0 where none acts.
     resected
         Whether the tumour's elements are removed.
+    intensity
+        What the level stands for, 0 to 1: from the lowest to the highest capillary permeability of table 1 for mannitol, a
+        fraction of the largest capillary pressure for swelling; 0 where neither acts.
     """
 
     mechanism: str
@@ -29,6 +32,7 @@ class AtlasEntry:
     fluid_level: float
     drug_level: int
     resected: bool
+    intensity: float = 0.0
 
 
 @dataclass(frozen=True)

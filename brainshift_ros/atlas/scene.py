@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from brainshift_ros.errors import InputError
+from brainshift_ros.mechanics.cases import SWELLING_MARGIN_MM
 from brainshift_ros.yaml_files import read_yaml, validated
 
 _EXAMPLE = "config/scene_demo.yaml"
@@ -19,13 +20,12 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class Gravity(_Part):
-    """Sag under gravity after cerebrospinal fluid drained (spec P9)."""
+class Head(_Part):
+    """Orientations of the head: which part of the brain is uppermost, free to move and open to the atmosphere."""
 
     direction: Vector = Field(description="unit vector along which gravity pulls, patient RAS")
     cone_deg: float = Field(20.0, ge=0.0, le=90.0, description="half angle of the cone of head orientations")
     orientations: int = Field(60, ge=1, le=2000)
-    fluid_levels: int = Field(3, ge=1, le=20)
 
     @field_validator("direction")
     @classmethod
@@ -34,6 +34,12 @@ class Gravity(_Part):
         if not 0.99 <= length <= 1.01:
             raise ValueError(f"must be a unit vector, its length is {length:.4g}")
         return (value[0] / length, value[1] / length, value[2] / length)
+
+
+class Gravity(Head):
+    """Sag under gravity after cerebrospinal fluid drained (spec P9)."""
+
+    fluid_levels: int = Field(3, ge=1, le=20)
 
 
 class Mannitol(_Part):
@@ -46,6 +52,7 @@ class Swelling(_Part):
     """Swelling of peritumoral tissue."""
 
     pressure_levels: int = Field(2, ge=1, le=20)
+    margin_mm: float = Field(SWELLING_MARGIN_MM, ge=0.0, le=100.0, description="how far from the tumour tissue still swells")
 
 
 class Craniotomy(_Part):
@@ -75,6 +82,7 @@ class Scene(_Part):
 
     version: Literal[1] = Field(1, description="of the scene's format; a file may leave it out")
     gravity: Gravity | None = None
+    head: Head | None = Field(None, description="in place of gravity, where it does not act")
     mannitol: Mannitol | None = None
     swelling: Swelling | None = None
     resection: Literal["none", "resected", "both"] = "none"
@@ -82,6 +90,27 @@ class Scene(_Part):
     craniotomy: Craniotomy | None = None
     model: Model = Model()
     tolerance_mm: Annotated[float, Field(gt=0.0, le=50.0)] | None = None
+
+
+def orientations_of(scene: Scene, source: object = "scene") -> Head:
+    """Orientations of the head: those of gravity, or `head` where gravity does not act.
+
+    The drug and the swelling need them as well: the orientation decides which part of the brain is free to move and drained.
+
+    Raises
+    ------
+    InputError
+        The scene names no mechanism, or gives the orientations twice or not at all.
+    """
+    if scene.gravity is None and scene.mannitol is None and scene.swelling is None:
+        raise InputError(source, "names no mechanism", "give at least one of gravity, mannitol, swelling")
+    if scene.gravity is not None and scene.head is not None:
+        raise InputError(source, "gives both gravity and head", "leave head out: gravity says how the head lies")
+    found = scene.gravity or scene.head
+    if found is None:
+        problem = "does not say how the head lies, which decides where the brain is free to move and drained"
+        raise InputError(source, problem, "give head: {direction: [x, y, z]}, the way gravity would pull, or gravity itself")
+    return found
 
 
 def read_scene(path: str | Path) -> Scene:
@@ -93,6 +122,5 @@ def read_scene(path: str | Path) -> Scene:
         The file is missing, is not YAML, or a key is unknown, missing or out of range; every fault is named.
     """
     scene = validated(path, Scene, read_yaml(path, "scene file", _EXAMPLE), _EXAMPLE)
-    if scene.gravity is None and scene.mannitol is None and scene.swelling is None:
-        raise InputError(path, "names no mechanism", "give at least one of gravity, mannitol, swelling")
+    orientations_of(scene, path)
     return scene

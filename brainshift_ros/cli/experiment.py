@@ -15,7 +15,11 @@ EXPERIMENTS: dict[str, tuple[str, str]] = {
     "segmentation": ("brainshift_ros.experiments.segmentation", "How far is automatic segmentation from the truth?"),
     "registration": ("brainshift_ros.experiments.registration", "What does registration accuracy cost in time? (E7)"),
     "meshing": ("brainshift_ros.experiments.meshing", "What does mesh size cost in time and memory? (E7)"),
+    "elements": ("brainshift_ros.experiments.elements", "Linear or quadratic elements, at which mesh size? (E7)"),
+    "skull": ("brainshift_ros.experiments.skull", "Free cap or contact: which atlas is closer to finite strain?"),
     "septa-gap": ("brainshift_ros.experiments.septa_gap", "What does a gap between septa and skull do to the field?"),
+    "consolidation": ("brainshift_ros.experiments.consolidation", "Does consolidation follow its series and stay smooth? (E8)"),
+    "mannitol": ("brainshift_ros.experiments.mannitol", "How nearly is a steady field that of a time in surgery? (E7)"),
 }
 
 

@@ -23,7 +23,7 @@ from brainshift_ros.image.itk import write_displacement_image
 from brainshift_ros.image.volume import Region, Volume
 from brainshift_ros.mesh.locate import PointLocator
 from brainshift_ros.mesh.patient import PatientModel
-from brainshift_ros.pictures.boundary import boundary_figure
+from brainshift_ros.pictures.boundary import BoundaryCase, boundary_figure
 from brainshift_ros.pictures.field import displacement_map, mr_before_after, vectors_on_cortex
 from brainshift_ros.pictures.patient_page import patient_page
 from brainshift_ros.pictures.scan import scan_page
@@ -78,7 +78,7 @@ def draw_all(
 
 def _draw_boundary(files: DemoFiles, case: RecordedCase) -> None:
     """Draw the truth's boundary conditions, as figure 5 of the thesis does the atlas's."""
-    figure = boundary_figure(case.truth.mesh, [("truth", case.truth.solution.kinds)])
+    figure = boundary_figure(case.truth.mesh, [BoundaryCase("truth", case.truth.solution.kinds)])
     with atomic_path(files.folder / "boundary.png") as temporary:
         figure.savefig(temporary, dpi=110)
 

@@ -17,7 +17,12 @@ def write_results(folder: Path, summary: Mapping[str, object], rows: Sequence[Ma
     """Write the figures that sum a study up, and the table they come from; every row has the keys of the first."""
     with atomic_path(folder / "summary.json") as temporary:
         temporary.write_text(json.dumps({"software": __version__, **summary}, indent=1), encoding="utf-8")
-    with atomic_path(folder / "table.csv") as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+    write_table(folder / "table.csv", rows)
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
+    """Write a table as CSV, whole or not at all; every row has the keys of the first."""
+    with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainshift_ros.mechanics.elasticity import assemble_laplacian
-from brainshift_ros.mechanics.solvers import SolverName, factorize
 from brainshift_ros.mesh.tetmesh import TetMesh
+from brainshift_ros.solvers.direct import SolverName, factorize
 
 Extend = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 

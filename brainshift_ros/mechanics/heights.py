@@ -23,8 +23,34 @@ def unit_direction(gravity_direction: ArrayLike) -> NDArray[np.float64]:
     return direction / length
 
 
-def height_over_level(nodes: NDArray[np.float64], gravity_direction: ArrayLike, level: float) -> NDArray[np.float64]:
-    """Signed height of each node over a level plane, m.
+def checked_levels(levels: ArrayLike) -> NDArray[np.float64]:
+    """Levels (k,) as an array.
+
+    Raises
+    ------
+    InputError
+        A level is not finite.
+    """
+    checked = np.asarray(levels, dtype=np.float64)
+    if not np.isfinite(checked).all():
+        problem = f"is {checked[~np.isfinite(checked)][0]}"
+        raise InputError("level", problem, "give a fraction of the head's extent along up, 0 to 1")
+    return checked
+
+
+def heights_over_levels(
+    nodes: NDArray[np.float64], up: NDArray[np.float64], levels: NDArray[np.float64], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """:func:`height_over_level` of points (n, 3) for k unit vectors, the columns of `up` (3, k), and levels (k,): (n, k)."""
+    height = nodes @ up
+    # Interpolated so, the levels 0 and 1 are exactly the lowest and the highest node's.
+    return points @ up - ((1.0 - levels) * height.min(axis=0) + levels * height.max(axis=0))
+
+
+def height_over_level(
+    nodes: NDArray[np.float64], gravity_direction: ArrayLike, level: float, points: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """Signed height over a level plane, m.
 
     Parameters
     ----------
@@ -34,14 +60,17 @@ def height_over_level(nodes: NDArray[np.float64], gravity_direction: ArrayLike, 
         Where gravity pulls.
     level
         Height of the plane as a fraction of the head's extent along up.
+    points
+        Shape (n, 3), m: whose height is asked; the head's nodes themselves if None.
+
+    Returns
+    -------
+    Shape (n,).
 
     Raises
     ------
     InputError
         The direction or the level is not finite, or the direction is zero.
     """
-    if not np.isfinite(level):
-        raise InputError("level", f"is {level}", "give a fraction of the head's extent along up, 0 to 1")
-    height = -(nodes @ unit_direction(gravity_direction))
-    lowest, highest = height.min(), height.max()
-    return height - (lowest + level * (highest - lowest))
+    up = -unit_direction(gravity_direction)[:, None]
+    return heights_over_levels(nodes, up, checked_levels([level]), nodes if points is None else points)[:, 0]

@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from brainshift_ros.errors import InputError
+from brainshift_ros.mechanics.faces import ElementFaces
 from brainshift_ros.mesh.tetmesh import TetMesh
-from brainshift_ros.surface.facets import LOCAL_FACES
 
 SHEETS = ("falx", "tentorium")
+
+#: Name of the facets of the wall that resection opens.
+CAVITY = "cavity"
 
 
 @dataclass(frozen=True)
@@ -44,35 +47,31 @@ def whole(mesh: TetMesh) -> Submesh:
     return Submesh(mesh, nodes, nodes, np.arange(len(mesh.elements)))
 
 
-def facet_owners(elements: NDArray[np.int32], facets: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Element whose outward face each facet is, shape (F,); -1 where there is none.
+def remove_elements(mesh: TetMesh, removed: NDArray[np.bool_], faces: ElementFaces | None = None) -> Submesh:
+    """Leave out elements with the nodes and named facets that only they carry; the walls that appear are the `cavity`.
 
-    Orientation tells the two elements of an inner facet apart.
+    Parameters
+    ----------
+    mesh
+        N nodes, M elements.
+    removed
+        Shape (M,).
+    faces
+        Those of the mesh, if they are known already.
     """
-    faces = _canonical(elements[:, LOCAL_FACES].reshape(-1, 3))
-    wanted = _canonical(facets)
-    size = 1 + max(int(faces.max(initial=0)), int(wanted.max(initial=0)))
-
-    def keys(triples: NDArray[np.int64]) -> NDArray[np.int64]:
-        return (triples[:, 0] * size + triples[:, 1]) * size + triples[:, 2]
-
-    face_keys = keys(faces)
-    order = np.argsort(face_keys)
-    position = np.minimum(np.searchsorted(face_keys, keys(wanted), sorter=order), len(order) - 1)
-    found = face_keys[order[position]] == keys(wanted)
-    return np.where(found, order[position] // 4, -1)
-
-
-def remove_elements(mesh: TetMesh, removed: NDArray[np.bool_]) -> Submesh:
-    """Leave out elements with the nodes and named facets that only they carry; the walls that appear carry no name."""
+    faces = ElementFaces(mesh.elements) if faces is None else faces
     kept = np.flatnonzero(~removed)
-    parent_node = np.unique(mesh.elements[kept])
+    parent_node = np.flatnonzero(np.bincount(mesh.elements[kept].ravel(), minlength=len(mesh.nodes)))
     node_of = np.full(len(mesh.nodes), -1, dtype=np.int64)
     node_of[parent_node] = np.arange(len(parent_node))
     facets = {}
     for name, triples in mesh.facets.items():
-        owners = facet_owners(mesh.elements, triples)
+        owners = faces.owners(triples)
         facets[name] = node_of[triples[(owners >= 0) & ~removed[owners]]].astype(np.int32)
+    one, other = faces.shared.T
+    wall = np.concatenate([one[~removed[one // 4] & removed[other // 4]], other[removed[one // 4] & ~removed[other // 4]]])
+    if len(wall):
+        facets[CAVITY] = node_of[faces.triples[wall]].astype(np.int32)
     sets = {name: node_of[ids][node_of[ids] >= 0].astype(np.int32) for name, ids in mesh.node_sets.items()}
     elements = node_of[mesh.elements[kept]].astype(np.int32)
     return Submesh(TetMesh(mesh.nodes[parent_node], elements, mesh.region[kept], facets, sets), node_of, parent_node, kept)
@@ -103,10 +102,11 @@ def compose(first: Submesh, second: Submesh) -> Submesh:
     return Submesh(second.mesh, node_of, first.parent_node[second.parent_node], first.parent_element[second.parent_element])
 
 
-def unsupported_elements(mesh: TetMesh, removed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def unsupported_elements(mesh: TetMesh, removed: NDArray[np.bool_], faces: ElementFaces | None = None) -> NDArray[np.bool_]:
     """Mask of kept elements that share no face, directly or through others, with an element on the fixed brainstem.
 
-    Their rigid motion would be undetermined (an edge is a hinge, a node a ball joint).
+    Their rigid motion would be undetermined (an edge is a hinge, a node a ball joint). Arguments as in
+    :func:`remove_elements`.
 
     Raises
     ------
@@ -116,22 +116,15 @@ def unsupported_elements(mesh: TetMesh, removed: NDArray[np.bool_]) -> NDArray[n
     brainstem = mesh.node_sets.get("brainstem", np.zeros(0, dtype=np.int32))
     if len(brainstem) == 0:
         raise InputError("mesh", "its brainstem node set is empty, so nothing holds the brain", "give a brainstem label")
-    kept = np.flatnonzero(~removed)
-    faces = np.sort(mesh.elements[kept][:, LOCAL_FACES].reshape(-1, 3), axis=1)
-    order = np.lexsort(faces.T)
-    same = np.flatnonzero(np.all(faces[order[1:]] == faces[order[:-1]], axis=1))
-    pairs = order[same] // 4, order[same + 1] // 4
-    graph = sp.coo_matrix((np.ones(len(same)), pairs), shape=(len(kept), len(kept)))
+    faces = ElementFaces(mesh.elements) if faces is None else faces
+    count = len(mesh.elements)
+    neighbours = faces.shared // 4
+    neighbours = neighbours[~removed[neighbours].any(axis=1)]
+    graph = sp.coo_matrix((np.ones(len(neighbours), dtype=np.int8), neighbours.T), shape=(count, count))
     _, component = connected_components(graph, directed=False)
-    fixed = np.isin(mesh.elements[kept], brainstem).sum(axis=1) >= 3
-    supported = np.isin(component, np.unique(component[fixed]))
-    unsupported = np.zeros(len(mesh.elements), dtype=bool)
-    unsupported[kept[~supported]] = True
-    return unsupported
-
-
-def _canonical(triples: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Rotate each triple so that its smallest id comes first; the orientation stays."""
-    wide = triples.astype(np.int64).reshape(-1, 3)
-    start = np.argmin(wide, axis=1)[:, None]
-    return np.take_along_axis(wide, (start + np.arange(3)) % 3, axis=1)
+    is_fixed = np.zeros(len(mesh.nodes), dtype=bool)
+    is_fixed[brainstem] = True
+    fixed = ~removed & (is_fixed[mesh.elements].sum(axis=1) >= 3)
+    held = np.zeros(count, dtype=bool)
+    held[component[fixed]] = True
+    return ~removed & ~held[component]

@@ -11,6 +11,7 @@ from brainshift_ros.atlas.orientations import directions_in_cone
 from brainshift_ros.geometry import unit
 from brainshift_ros.mechanics.forward import ForwardSolution, solve_gravity
 from brainshift_ros.mechanics.materials import Material, material_of
+from brainshift_ros.mechanics.skull import SkullName
 from brainshift_ros.mesh.locate import PointLocator
 from brainshift_ros.mesh.patient import PatientModel
 from brainshift_ros.mesh.tetmesh import TetMesh
@@ -91,6 +92,8 @@ def simulate_truth(
     *,
     seed: int,
     resected: bool = False,
+    skull: SkullName = "free_cap",
+    opening: NDArray[np.bool_] | None = None,
     stiffness_spread: float = 0.25,
     stiffness_length_m: float = 0.03,
 ) -> Truth:
@@ -100,7 +103,7 @@ def simulate_truth(
     ----------
     patient
         The head, on a mesh that is not the atlas's.
-    gravity_direction, fluid_level, resected
+    gravity_direction, fluid_level, resected, skull, opening
         As in :func:`brainshift_ros.mechanics.forward.solve_gravity`.
     seed
         Decides the stiffness field.
@@ -114,5 +117,5 @@ def simulate_truth(
     nominal = material_of(patient.tissue)
     material = replace(nominal, youngs_modulus=nominal.youngs_modulus * np.exp(stiffness_spread * variation))
     direction = unit(gravity_direction)
-    solution = solve_gravity(patient.mesh, material, direction, fluid_level, resected=resected)
+    solution = solve_gravity(patient.mesh, material, direction, fluid_level, resected=resected, skull=skull, opening=opening)
     return Truth(patient.mesh, solution, material, direction, fluid_level)

@@ -1,4 +1,4 @@
-"""MKL PARDISO for symmetric positive definite matrices, with its Schur complement.
+"""MKL PARDISO for symmetric matrices, positive definite or not, with its Schur complement.
 
 The library is called directly: the `pypardiso` wrapper knows neither separate phases nor the Schur complement, and compares
 the whole matrix again before every solve.
@@ -16,19 +16,23 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-_SPD = 2
-_ANALYSE, _FACTORISE, _SOLVE, _FORWARD, _BACKWARD, _RELEASE = 11, 22, 33, 331, 333, -1
+_SPD, _INDEFINITE = 2, -2
+_ANALYSE, _FACTORISE, _SOLVE, _FORWARD, _DIAGONAL, _BACKWARD, _RELEASE = 11, 22, 33, 331, 332, 333, -1
 
 #: iparm indices, zero-based (the manual counts from one).
-_CUSTOM, _ORDERING, _REFINEMENT, _ZERO_BASED, _SCHUR = 0, 1, 7, 34, 35
-_METIS = 2
+_CUSTOM, _ORDERING, _PERTURBATION, _PIVOTING, _ZERO_BASED, _SCHUR = 0, 1, 9, 20, 34, 35
+_METIS, _BUNCH_KAUFMAN = 2, 1
+
+#: An indefinite matrix's pivots below 10 to minus this times its norm are replaced by that.
+_SMALLEST_PIVOT = 13
 
 
 class PardisoError(ArithmeticError):
     """PARDISO's own error code; -4 is a matrix that is not positive definite, -2 a lack of memory."""
 
     def __init__(self, code: int, phase: int) -> None:
-        meaning = {-1: "inconsistent input", -2: "not enough memory", -4: "the matrix is not positive definite"}
+        indefinite = "the matrix is not positive definite: something must hold the body against rigid motion"
+        meaning = {-1: "inconsistent input", -2: "not enough memory", -4: indefinite}
         super().__init__(f"MKL PARDISO failed in phase {phase} with error {code} ({meaning.get(code, 'see its manual')})")
 
 
@@ -63,14 +67,16 @@ def _mkl_path() -> str:
 
 
 class Pardiso:
-    """Factorisation of an SPD matrix, optionally condensed to a set of retained dofs.
+    """Factorisation of a symmetric matrix, optionally condensed to a set of retained dofs.
 
     Parameters
     ----------
     matrix
-        Symmetric positive definite, both triangles stored.
+        Symmetric, both triangles stored.
     retained
         Boolean mask of dofs that are kept out of the elimination; None factorises everything.
+    definite
+        Positive definite (L L^T), else L D L^T with Bunch and Kaufman's pivoting; that wants entries of like size.
 
     Attributes
     ----------
@@ -80,8 +86,9 @@ class Pardiso:
 
     name = "pardiso"
 
-    def __init__(self, matrix: sp.csr_matrix, retained: NDArray[np.bool_] | None = None) -> None:
+    def __init__(self, matrix: sp.csr_matrix, retained: NDArray[np.bool_] | None = None, *, definite: bool = True) -> None:
         self._mkl = load_mkl()
+        self._kind = _SPD if definite else _INDEFINITE
         upper = sp.triu(matrix, format="csr")
         upper.sort_indices()
         self.size = upper.shape[0]
@@ -92,8 +99,10 @@ class Pardiso:
         self._handle = np.zeros(64, dtype=np.int64)
         self._iparm = np.zeros(64, dtype=np.int32)
         self._iparm[[_CUSTOM, _ORDERING, _ZERO_BASED]] = 1, _METIS, 1
+        if not definite:
+            self._iparm[[_PERTURBATION, _PIVOTING]] = _SMALLEST_PIVOT, _BUNCH_KAUFMAN
         self.schur: NDArray[np.float64] | None = None
-        self._finalizer = weakref.finalize(self, _release, self._mkl, self._handle, self._iparm, self.size)
+        self._finalizer = weakref.finalize(self, _release, self._mkl, self._kind, self._handle, self._iparm, self.size)
         nothing = np.zeros((self.size, 1), order="F")
         if retained is None:
             self._call(_ANALYSE, nothing, nothing)
@@ -125,14 +134,16 @@ class Pardiso:
 
     def _substitute(self, phase: int, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         # MKL reads the block column by column; a C-ordered block would be silently taken for its transpose.
-        block = np.array(rhs, dtype=np.float64, order="F", ndmin=2)
-        solution = np.zeros_like(block, order="F")
-        self._call(phase, block, solution)
+        block = np.asfortranarray(rhs, dtype=np.float64)
+        solution = np.empty_like(block)
+        if block.size:  # MKL refuses none
+            self._call(phase, block, solution)
         return solution
 
     def _call(self, phase: int, rhs: NDArray[np.float64], solution: NDArray[np.float64]) -> None:
         _pardiso(
             self._mkl,
+            self._kind,
             phase,
             self._handle,
             self._iparm,
@@ -145,6 +156,7 @@ class Pardiso:
 
 def _pardiso(
     mkl: ctypes.CDLL,
+    kind: int,
     phase: int,
     handle: NDArray[np.int64],
     iparm: NDArray[np.int32],
@@ -154,7 +166,7 @@ def _pardiso(
     solution: NDArray[np.float64],
 ) -> None:
     # maxfct, mnum, mtype, phase, n, nrhs, msglvl, error: PARDISO takes all of them by reference.
-    scalars = np.array([1, 1, _SPD, phase, size, rhs.shape[1], 0, 0], dtype=np.int32)
+    scalars = np.array([1, 1, kind, phase, size, rhs.shape[1], 0, 0], dtype=np.int32)
     maxfct, mnum, mtype, phase_, n, nrhs, msglvl, error = (scalars[i:].ctypes.data for i in range(8))
     values, starts, columns, permutation = (array.ctypes.data for array in matrix)
     call = mkl["pardiso"]
@@ -168,7 +180,7 @@ def _pardiso(
         raise PardisoError(int(scalars[7]), phase)
 
 
-def _release(mkl: ctypes.CDLL, handle: NDArray[np.int64], iparm: NDArray[np.int32], size: int) -> None:
+def _release(mkl: ctypes.CDLL, kind: int, handle: NDArray[np.int64], iparm: NDArray[np.int32], size: int) -> None:
     empty = np.zeros(1, dtype=np.float64)
     index = np.zeros(1, dtype=np.int32)
-    _pardiso(mkl, _RELEASE, handle, iparm, size, (empty, index, index, index), np.zeros((1, 1)), np.zeros((1, 1)))
+    _pardiso(mkl, kind, _RELEASE, handle, iparm, size, (empty, index, index, index), np.zeros((1, 1)), np.zeros((1, 1)))

@@ -1,4 +1,9 @@
-"""Direct solvers for the symmetric positive definite systems of elasticity, chosen by name."""
+"""Direct solvers for symmetric sparse systems, chosen by name.
+
+Positive definite ones, of elasticity and steady pressure, and quasi-definite ones, ``[[A, B], [B^T, -C]]`` with A and C
+positive definite, of consolidation. Those too factorise in any order (Vanderbei, SIAM J. Optim. 5, 1995), the worse the
+smaller C is; give them with rows of like size (:func:`equilibration`).
+"""
 
 from __future__ import annotations
 
@@ -10,19 +15,22 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
 from brainshift_ros.errors import InputError
-from brainshift_ros.mechanics.pardiso import Pardiso, load_mkl
+from brainshift_ros.solvers.pardiso import Pardiso, load_mkl
 
 SolverName = Literal["auto", "pardiso", "scipy"]
 
 #: Right-hand sides that are solved together: enough to fill the processor, few enough to stay small in memory.
 BLOCK = 128
 
+#: SuperLU leaves a diagonal pivot of an indefinite matrix that is smaller than this share of its column.
+INDEFINITE_PIVOT = 0.01
+
 #: Largest relative residual of a solution that is passed on.
 RESIDUAL_LIMIT = 1e-8
 
 
 class Factorization(Protocol):
-    """A factorised SPD matrix: `solve` takes and gives (n, k)."""
+    """A factorised matrix: `solve` takes and gives (n, k)."""
 
     name: str
 
@@ -32,7 +40,7 @@ class Factorization(Protocol):
 
 
 class Condensation(Protocol):
-    """An SPD matrix factorised up to its Schur complement on some retained dofs (static condensation).
+    """A matrix factorised up to its Schur complement on some retained dofs (static condensation).
 
     Between `forward` and `backward` the retained rows are the caller's: they come as the condensed right-hand side g and
     must go back as the solution x of ``schur @ x = g``, or of any subset of it with the other rows zero.
@@ -55,11 +63,13 @@ class SuperLU:
 
     name = "scipy"
 
-    def __init__(self, matrix: sp.csr_matrix) -> None:
+    def __init__(self, matrix: sp.csr_matrix, *, definite: bool = True) -> None:
+        threshold = 0.0 if definite else INDEFINITE_PIVOT
+        options = {"SymmetricMode": True}
         try:
-            self._lu = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+            self._lu = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=threshold, options=options)
         except RuntimeError as error:
-            raise ArithmeticError(f"SuperLU: {error}") from error
+            raise ArithmeticError(f"SuperLU: {error}: something must hold the body against rigid motion") from error
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Solve for right-hand sides (n, k)."""
@@ -71,9 +81,9 @@ class SuperLUCondensation:
 
     name = "scipy"
 
-    def __init__(self, matrix: sp.csr_matrix, retained: NDArray[np.bool_]) -> None:
+    def __init__(self, matrix: sp.csr_matrix, retained: NDArray[np.bool_], *, definite: bool = True) -> None:
         self._inner, self._retained = np.flatnonzero(~retained), np.flatnonzero(retained)
-        self._lu = SuperLU(matrix[self._inner][:, self._inner])
+        self._lu = SuperLU(matrix[self._inner][:, self._inner], definite=definite)
         self._coupling = matrix[self._inner][:, self._retained].tocsc()
         self.schur = matrix[self._retained][:, self._retained].toarray()
         for start in range(0, len(self._retained), BLOCK):
@@ -121,16 +131,28 @@ def resolve(solver: SolverName) -> Literal["pardiso", "scipy"]:
     return "pardiso"
 
 
-def factorize(matrix: sp.csr_matrix, solver: SolverName = "auto") -> Factorization:
-    """Factorise a sparse SPD matrix."""
-    return Pardiso(matrix) if resolve(solver) == "pardiso" else SuperLU(matrix)
+def factorize(matrix: sp.csr_matrix, solver: SolverName = "auto", *, definite: bool = True) -> Factorization:
+    """Factorise a sparse symmetric matrix, positive or quasi-definite."""
+    return Pardiso(matrix, definite=definite) if resolve(solver) == "pardiso" else SuperLU(matrix, definite=definite)
 
 
-def condense(matrix: sp.csr_matrix, retained: NDArray[np.bool_], solver: SolverName = "auto") -> Condensation:
-    """Factorise a sparse SPD matrix up to the Schur complement on the retained dofs (mask, at least one)."""
+def condense(
+    matrix: sp.csr_matrix, retained: NDArray[np.bool_], solver: SolverName = "auto", *, definite: bool = True
+) -> Condensation:
+    """Factorise a sparse symmetric matrix up to the Schur complement on the retained dofs (mask, at least one)."""
     if resolve(solver) == "pardiso":
-        return PardisoCondensation(matrix, retained)
-    return SuperLUCondensation(matrix, retained)
+        return PardisoCondensation(matrix, retained, definite=definite)
+    return SuperLUCondensation(matrix, retained, definite=definite)
+
+
+def equilibration(matrix: sp.csr_matrix, steps: int = 8) -> NDArray[np.float64]:
+    """Weights d (n,) for which all rows of ``diag(d) A diag(d)`` have a largest entry of about one (Ruiz, RAL-TR-2001-034)."""
+    weight = np.ones(matrix.shape[0])
+    magnitude = abs(matrix).tocsr()
+    for _ in range(steps):
+        largest = (sp.diags(weight) @ magnitude @ sp.diags(weight)).max(axis=1).toarray().ravel()
+        weight /= np.sqrt(np.where(largest > 0.0, largest, 1.0))
+    return weight
 
 
 def relative_residual(
@@ -158,4 +180,5 @@ def assert_residual(residual: float, solver: str) -> None:
         The residual is above :data:`RESIDUAL_LIMIT` or not a number.
     """
     if not residual <= RESIDUAL_LIMIT:
-        raise ArithmeticError(f"{solver}: relative residual {residual:.2g} is above {RESIDUAL_LIMIT:.0e}: no solution")
+        problem = f"relative residual {residual:.2g} is above {RESIDUAL_LIMIT:.0e}: no solution"
+        raise ArithmeticError(f"{solver}: {problem}: is the body held against rigid motion, and is every element sound?")

@@ -1,0 +1,1 @@
+"""Programs of others that do the same, run in an environment of their own."""
