@@ -15,6 +15,7 @@ EXPERIMENTS: dict[str, tuple[str, str]] = {
     "segmentation": ("brainshift_ros.experiments.segmentation", "How far is automatic segmentation from the truth?"),
     "registration": ("brainshift_ros.experiments.registration", "What does registration accuracy cost in time? (E7)"),
     "meshing": ("brainshift_ros.experiments.meshing", "What does mesh size cost in time and memory? (E7)"),
+    "scaling": ("brainshift_ros.experiments.scaling", "What does an atlas of 720 entries cost, over mesh size? (E7)"),
     "elements": ("brainshift_ros.experiments.elements", "Linear or quadratic elements, at which mesh size? (E7)"),
     "skull": ("brainshift_ros.experiments.skull", "Free cap or contact: which atlas is closer to finite strain?"),
     "septa-gap": ("brainshift_ros.experiments.septa_gap", "What does a gap between septa and skull do to the field?"),

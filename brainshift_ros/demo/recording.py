@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from brainshift_ros.atlas.file import AtlasFile
+from brainshift_ros.atlas.problem import under_craniotomy
 from brainshift_ros.bags import BagWriter
 from brainshift_ros.demo.settings import DemoFiles, DemoSettings
 from brainshift_ros.geometry import invert_rigid, rigid, transform_points, unit
@@ -63,7 +64,7 @@ class RecordedCase:
 def simulate_case(
     settings: DemoSettings, atlas: AtlasFile, truth_patient: PatientModel, images: TemplateImages
 ) -> RecordedCase:
-    """Solve the truth and scan its cortex twice.
+    """Solve the truth, with one-sided skull contact, and scan its cortex twice.
 
     The truth has another mesh, another stiffness, an orientation as far as can be from the atlas's own, another fluid level,
     and a cortex that differs from the registration's target by a segmentation error.
@@ -75,7 +76,9 @@ def simulate_case(
         [entry.gravity_direction for entry in atlas.entries], gravity.direction, np.radians(gravity.cone_deg)
     )
     level = max(entry.fluid_level for entry in atlas.entries) + settings.fluid_level_offset
-    truth = simulate_truth(truth_patient, direction, level, seed=settings.case_seed)
+    # Whatever the atlas assumes: a brain does not pass through bone.
+    opening = under_craniotomy(truth_patient.mesh, craniotomy)
+    truth = simulate_truth(truth_patient, direction, level, seed=settings.case_seed, skull="contact", opening=opening)
 
     cortex = _true_cortex(images, settings.case_seed)
     scene = make_scene(cortex, mm_to_m(craniotomy.center_mm), float(mm_to_m(craniotomy.diameter_mm)), settings.case_seed)

@@ -24,6 +24,11 @@ Progress = Callable[[str, float], None]
 CENTER_MM, RADIUS_MM = (-35.0, 45.0, 50.0), 35.0
 
 
+def patient_path(folder: Path, nodes: int, seed: int) -> Path:
+    """Where :func:`template_patient` keeps a model."""
+    return folder / f"patient_{nodes}_{seed}.h5"
+
+
 def template_patient(folder: Path, nodes: int, seed: int, progress: Progress) -> PatientModel:
     """Mesh the template once; later calls read the file in `folder`, which may be deleted to mesh again.
 
@@ -36,7 +41,7 @@ def template_patient(folder: Path, nodes: int, seed: int, progress: Progress) ->
     progress
         Called with stage and fraction done.
     """
-    path = folder / f"patient_{nodes}_{seed}.h5"
+    path = patient_path(folder, nodes, seed)
     if path.is_file():
         return read_patient(path)
     images = template_patient_images(septa_spacing_mm=septa_spacing_mm(nodes))

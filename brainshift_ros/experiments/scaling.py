@@ -12,13 +12,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from brainshift_ros.experiments import scaling_case
+from brainshift_ros.experiments.patients import patient_path, template_patient
 from brainshift_ros.experiments.results import write_figure, write_results
-from brainshift_ros.mesh.build import build_patient
-from brainshift_ros.mesh.patient import ImageReference
-from brainshift_ros.mesh.patient_file import write_patient
-from brainshift_ros.mesh.template_patient import template_patient_images
 from brainshift_ros.resources import resource
-from brainshift_ros.septa.sheets import septa_spacing_mm
 from brainshift_ros.worker_process import run_worker
 
 Progress = Callable[[str, float], None]
@@ -49,12 +45,9 @@ def run(folder: Path, full: bool, progress: Progress) -> dict[str, object]:
     """
     rows: list[dict[str, Any]] = []
     for nodes in (*SIZES, *LARGE) if full else SIZES:
-        patient = folder / f"patient_{nodes}.h5"
-        progress(f"{nodes} nodes: patient", 0.0)
-        if not patient.is_file():
-            _make_patient(nodes, patient)
-        progress(f"{nodes} nodes: atlas", 0.5)
-        rows.append({"asked": nodes, **_measured(patient)})
+        template_patient(folder, nodes, 0, progress)
+        progress(f"{nodes} nodes: atlas", 0.0)
+        rows.append({"asked": nodes, **_measured(patient_path(folder, nodes, 0))})
         progress(f"{nodes} nodes: atlas", 1.0)
     exponents = {key: _exponent(rows, key) for key in ("wall, s", "CPU, s", "peak memory, MB")}
     summary: dict[str, object] = {"scene": SCENE, "grows with the number of nodes to the power": exponents, "rows": rows}
@@ -86,12 +79,6 @@ def chart(rows: list[dict[str, Any]]) -> Figure:
         axes.grid(visible=True, which="both", alpha=0.25)
         axes.legend(fontsize=8)
     return figure
-
-
-def _make_patient(nodes: int, path: Path) -> None:
-    images = template_patient_images(septa_spacing_mm=septa_spacing_mm(nodes))
-    image = ImageReference("template", "0" * 64, images.t1.shape, images.t1.T_patient_voxel)
-    write_patient(path, build_patient(images.t1, images.labels, images.septa, image_ref=image, nodes=nodes))
 
 
 def _measured(patient: Path) -> dict[str, Any]:

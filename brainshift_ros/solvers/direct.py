@@ -104,6 +104,23 @@ class SuperLUCondensation:
         return result
 
 
+class NothingEliminated:
+    """All dofs are retained, so that the Schur complement is the matrix itself; PARDISO leaves it undefined then."""
+
+    name = "dense"
+
+    def __init__(self, matrix: sp.csr_matrix) -> None:
+        self.schur = matrix.toarray()
+
+    def forward(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Nothing is to be eliminated."""
+        return rhs.copy()
+
+    def backward(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Nothing is to be recovered."""
+        return rhs.copy()
+
+
 class PardisoCondensation(Pardiso):
     """MKL PARDISO's Schur complement, which falls off the factorisation."""
 
@@ -140,6 +157,8 @@ def condense(
     matrix: sp.csr_matrix, retained: NDArray[np.bool_], solver: SolverName = "auto", *, definite: bool = True
 ) -> Condensation:
     """Factorise a sparse symmetric matrix up to the Schur complement on the retained dofs (mask, at least one)."""
+    if retained.all():
+        return NothingEliminated(matrix)
     if resolve(solver) == "pardiso":
         return PardisoCondensation(matrix, retained, definite=definite)
     return SuperLUCondensation(matrix, retained, definite=definite)
