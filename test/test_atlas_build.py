@@ -46,11 +46,19 @@ def built(request, tmp_path_factory):
 
 def test_every_entry_equals_its_own_solution(built):
     _, atlas, _, solver = built
-    material = material_of(PATIENT.tissue)
+    material, opening = material_of(PATIENT.tissue), under_craniotomy(PATIENT.mesh, SCENE.craniotomy)
     assert len(atlas.entries) == 24
+    assert SCENE.model.skull == "contact"  # the default
     for column, entry in enumerate(atlas.entries):
         alone = solve_gravity(
-            PATIENT.mesh, material, entry.gravity_direction, entry.fluid_level, resected=entry.resected, solver=solver
+            PATIENT.mesh,
+            material,
+            entry.gravity_direction,
+            entry.fluid_level,
+            resected=entry.resected,
+            skull="contact",
+            opening=opening,
+            solver=solver,
         ).displacement
         assert np.abs(alone).max() > 1e-4
         # The file holds float32.
