@@ -12,7 +12,6 @@ from rich.table import Table
 
 from bench import atlas, inverse
 from bench.peers import slip
-from brainshift_ros.atlas.build import build_atlas
 from brainshift_ros.atlas.columns import entries_of
 from brainshift_ros.atlas.scene import read_scene
 from brainshift_ros.demo.preparation import make_images, make_patients
@@ -52,7 +51,8 @@ def main(output: Path, solver: SolverName) -> None:
     scene = read_scene(full)
     results: dict[str, list[dict[str, Any]]] = {}
     with console.status(f"atlas of {len(entries_of(scene))} entries"):
-        results["atlas"] = [atlas.build(files.patient, full, output)]
+        small = atlas.build("30 orientations, one level", files.patient, demo, output / "atlas_demo.h5")
+        results["atlas"] = [atlas.build("whole atlas", files.patient, full, output / "atlas.h5"), small]
     show(console, f"the whole atlas of {len(patient.mesh.nodes)} nodes", results["atlas"])
     with console.status("file"):
         results["file"] = atlas.read(output / "atlas.h5")
@@ -73,7 +73,6 @@ def main(output: Path, solver: SolverName) -> None:
         results["ngsolve_slip"] = [slip.compare(order) for order in (1, 2)]
     show(console, "the whole chain by NGSolve: a bar with slip walls", results["ngsolve_slip"])
     with console.status("inverse"):
-        build_atlas(patient, read_scene(demo), output / "atlas_demo.h5")
         results["inverse"] = inverse.run(output / "atlas_demo.h5", patient)
     title = f"inverse from {inverse.POINTS} points, noise {1e3 * inverse.NOISE_M} mm; truth on the atlas's own mesh"
     show(console, title, results["inverse"])

@@ -40,16 +40,16 @@ ROWS, COLUMNS = 300, 10
 _TIMEOUT_S = 3600.0
 
 
-def build(patient_path: Path, scene_path: Path, folder: Path) -> dict[str, Any]:
-    """Build the atlas in a process of its own, so that time and peak memory are its own; it stays in the folder."""
+def build(what: str, patient_path: Path, scene_path: Path, output: Path) -> dict[str, Any]:
+    """Build an atlas in a process of its own, so that time and peak memory are its own."""
     with tempfile.TemporaryDirectory(prefix="brainshift-bench-", ignore_cleanup_errors=True) as temporary:
         made = Path(temporary, "row.json")
-        paths = (patient_path.absolute(), scene_path.absolute(), (folder / "atlas.h5").absolute(), made)
+        paths = (patient_path.absolute(), scene_path.absolute(), output.absolute(), made)
         worker = run_worker(scaling_case.__name__, [str(path) for path in paths], Path(temporary), timeout_s=_TIMEOUT_S)
         if worker.status != 0:
             raise RuntimeError(f"the atlas was not built: {worker.last_line}")
         row = json.loads(made.read_text(encoding="utf-8"))
-    return {"what": "whole atlas", **row, "peak memory, MB": worker.peak_bytes / 1e6}
+    return {"what": what, **row, "peak memory, MB": worker.peak_bytes / 1e6}
 
 
 def read(path: Path) -> list[dict[str, Any]]:
@@ -81,7 +81,7 @@ def against_refactoring(
     material = material_of(patient.tissue)
     rows = []
     for resected in (False, True):
-        cases = _sample([case_of(entry) for entry in entries_of(scene) if entry.resected == resected])
+        cases = _sample([case_of(entry, scene) for entry in entries_of(scene) if entry.resected == resected])
         system = assemble_system(patient.mesh, material, resected=resected, septa=scene.septa, solver=solver)
         every = list(dict.fromkeys(entry.gravity_direction for entry in entries_of(scene)))
         model = SteadyModel(system, every, skull=skull, opening=opening, solver=solver)
@@ -114,7 +114,7 @@ def against_refactoring(
 def against_ngsolve(patient: PatientModel, scene: Scene) -> list[dict[str, Any]]:
     """Factorise and solve the matrix of one boundary-condition set by our solver and by NGSolve's sparse Cholesky."""
     system = assemble_system(patient.mesh, material_of(patient.tissue), septa=scene.septa)
-    case = case_of(entries_of(scene)[0])
+    case = case_of(entries_of(scene)[0], scene)
     free = np.flatnonzero(~system.constrained(case.gravity_direction))
     matrix = system.stiffness[free][:, free].tocsr()
     load = system.gravity(case.gravity_direction, case.fluid_level)[free, None]
