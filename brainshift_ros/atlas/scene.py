@@ -74,9 +74,10 @@ class Model(_Part):
 
     element: Literal["P1", "P2"] = "P1"
     time: Literal["steady"] | Transient = "steady"
-    skull: Literal["free_cap", "contact"] = Field(
-        "contact", description="above the demarcation: nothing holds the brain, or it may leave the skull but not cross it"
-    )
+    skull: Annotated[
+        Literal["free_cap", "contact"],
+        Field(description="above the demarcation: nothing holds the brain, or it may leave the skull but not cross it"),
+    ] = "contact"
 
 
 class Scene(_Part):

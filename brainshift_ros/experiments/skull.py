@@ -34,6 +34,7 @@ from brainshift_ros.mechanics.materials import material_of
 from brainshift_ros.mechanics.system import assemble_system
 from brainshift_ros.mesh.locate import PointLocator
 from brainshift_ros.mesh.patient import PatientModel
+from brainshift_ros.simulation.contact_newton import NoEquilibriumError
 from brainshift_ros.simulation.truth import direction_between
 from brainshift_ros.units import m_to_mm, mm_to_m
 
@@ -93,6 +94,7 @@ def run(folder: Path, full: bool, progress: Progress) -> dict[str, Any]:
     states = (False, True) if full else (False,)
     rows: list[Row] = []
     solved: list[Row] = []
+    unsolved: list[Row] = []
     for number, (name, direction) in enumerate(planned):
         progress("truths and atlases", number / len(planned))
         atlases = inverse.atlases(direction)
@@ -102,8 +104,12 @@ def run(folder: Path, full: bool, progress: Progress) -> dict[str, Any]:
             for resected in states:
                 case = TruthCase(name, true_direction, cap_level, resected)
                 labels = {"orientation": name, "truth's cap": cap, "resected": resected}
-                with Stopwatch() as watch:
-                    truth = truths.solve(case)
+                try:
+                    with Stopwatch() as watch:
+                        truth = truths.solve(case)
+                except NoEquilibriumError as error:
+                    unsolved.append(labels | {"why": str(error)})
+                    continue
                 sag_mm = float(m_to_mm(np.linalg.norm(truth.displacement[truths.opening], axis=1).max()))
                 solved.append(
                     labels
@@ -118,9 +124,11 @@ def run(folder: Path, full: bool, progress: Progress) -> dict[str, Any]:
                 )
                 rows += _forward_rows(truths, case, truth.displacement, labels)
                 rows += inverse.rows(truths, case, truth.displacement, labels, atlases)
-                summary = _summary(rows, solved, inverse.build_cpu_s)
+                summary = _summary(rows, solved, inverse.build_cpu_s) | {"truths without equilibrium": unsolved}
                 write_results(folder, summary, rows)
     progress("truths and atlases", 1.0)
+    if not rows:
+        raise NoEquilibriumError(f"no truth was solved: {unsolved}")
     for kind in ("forward", "inverse"):
         write_figure(folder / f"skull_{kind}.png", _figure([row for row in rows if row["kind"] == kind], kind))
     return summary

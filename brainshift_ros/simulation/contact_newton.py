@@ -226,9 +226,10 @@ def _direction(
             behind = many.solve_block(rhs[:, None], [0]).solution[:, 0].reshape(-1, 3)
             break
         except ArithmeticError as error:
-            fault = error
+            # Its text only: kept itself, it would keep this frame and with it a gigabyte of factors.
+            fault = str(error)
     else:
-        raise NoEquilibriumError(f"the tangent is far from positive definite: {fault}") from fault
+        raise NoEquilibriumError(f"the tangent is far from positive definite: {fault}")
     step = to_wall + behind
     step[supports.held] = 0.0
     reaction = -(unbalanced.ravel() + stiffness @ step.ravel()).reshape(-1, 3)
