@@ -247,8 +247,10 @@ def _patient_at_hand(monkeypatch):
 
 @pytest.mark.usefixtures("_patient_at_hand")
 def test_command_builds_and_shows(tmp_path, scene_path):
-    result = run(scene_path, "--patient", "patient.h5", "-o", tmp_path / "atlas.h5", "--solver", "scipy")
+    page = tmp_path / "conditions.png"
+    result = run(scene_path, "--patient", "patient.h5", "-o", tmp_path / "atlas.h5", "--solver", "scipy", "--page", page)
     assert result.exit_code == 0, result.output
+    assert page.read_bytes().startswith(b"\x89PNG")
     assert "2 entries by scipy" in result.output.replace("\n", " ")
     shown = shown_text(tmp_path / "atlas.h5")
     assert PATIENT.patient_id[:20] in shown

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from mechanics_cases import head
+from mechanics_cases import head, patient
 
+from brainshift_ros.atlas.scene import Craniotomy, Gravity, Mannitol, Model, Scene
 from brainshift_ros.mechanics.boundary import boundary_of, in_cap, node_kinds
 from brainshift_ros.mechanics.space import space_of
 from brainshift_ros.pictures.boundary import BoundaryCase, boundary_figure, draw_facets
+from brainshift_ros.pictures.conditions import conditions_page
 
 
 def test_the_cap_is_red_on_top_and_the_brainstem_blue():
@@ -43,3 +45,22 @@ def test_near_facets_are_drawn_last():
         axes = Figure().subplots()
         draw_facets(axes, nodes, facets, colors, (0.0, 0.0, camera), (0.0, 1.0, 0.0))
         np.testing.assert_allclose(axes.collections[0].get_facecolor()[-1, :3], last)
+
+
+def test_a_scene_s_conditions_are_drawn_for_three_orientations():
+    scene = Scene(
+        gravity=Gravity(direction=(0.0, 0.0, -1.0), cone_deg=25.0, orientations=6, fluid_levels=2),
+        mannitol=Mannitol(),
+        resection="both",
+        craniotomy=Craniotomy(center_mm=(0.0, 0.0, 70.0), diameter_mm=60.0),
+    )
+    figure = conditions_page(patient(head(8)), scene)
+    titles = [axes.get_title() for axes in figure.axes]
+    for row, times in (("skull, from below", 3), ("wall of the resected tumour", 3), ("pressure, gravity", 6), ("mannitol", 3)):
+        assert sum(row in title for title in titles) == times
+    labels = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert {"fixed", "slip", "stress-free", "one-sided skull contact", "cavity wall (stress-free)"} <= labels
+    free_cap = scene.model_copy(update={"model": Model(skull="free_cap"), "resection": "none"})
+    labels = {text.get_text() for text in conditions_page(patient(head(8)), free_cap).legends[0].get_texts()}
+    assert "stress-free" in labels
+    assert not labels & {"one-sided skull contact", "cavity wall (stress-free)"}
