@@ -100,7 +100,7 @@ def boundary_figure(mesh: TetMesh, cases: Sequence[BoundaryCase]) -> Figure:
             Patch(color=color, label=label)
             for color, label in zip(PRESSURE_COLORS, ("pressure: no flux", "pressure: atmospheric"), strict=True)
         ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)), frameon=False)
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(2 * len(cases), len(handles)), frameon=False)
     return figure
 
 
