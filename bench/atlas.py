@@ -5,8 +5,6 @@ All in one run, so that the machine's load is the same for all: time, CPU, memor
 
 from __future__ import annotations
 
-import json
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from brainshift_ros.atlas.file import open_atlas
 from brainshift_ros.atlas.problem import case_of, under_craniotomy
 from brainshift_ros.atlas.scene import Scene
 from brainshift_ros.experiments import scaling_case
+from brainshift_ros.experiments.own_process import measured
 from brainshift_ros.mechanics.cases import Case
 from brainshift_ros.mechanics.forward import solve_case
 from brainshift_ros.mechanics.materials import material_of
@@ -29,7 +28,6 @@ from brainshift_ros.mechanics.steady import SteadyModel
 from brainshift_ros.mechanics.system import assemble_system
 from brainshift_ros.mesh.patient import PatientModel
 from brainshift_ros.solvers.direct import SolverName, factorize
-from brainshift_ros.worker_process import run_worker
 
 #: Directions whose entries are also solved by factorisations of their own, in each resection state.
 SAMPLED_DIRECTIONS = 10
@@ -37,19 +35,11 @@ SAMPLED_DIRECTIONS = 10
 #: Points whose rows are read from the file, and columns.
 ROWS, COLUMNS = 300, 10
 
-_TIMEOUT_S = 3600.0
-
 
 def build(what: str, patient_path: Path, scene_path: Path, output: Path) -> dict[str, Any]:
     """Build an atlas in a process of its own, so that time and peak memory are its own."""
-    with tempfile.TemporaryDirectory(prefix="brainshift-bench-", ignore_cleanup_errors=True) as temporary:
-        made = Path(temporary, "row.json")
-        paths = (patient_path.absolute(), scene_path.absolute(), output.absolute(), made)
-        worker = run_worker(scaling_case.__name__, [str(path) for path in paths], Path(temporary), timeout_s=_TIMEOUT_S)
-        if worker.status != 0:
-            raise RuntimeError(f"the atlas was not built: {worker.last_line}")
-        row = json.loads(made.read_text(encoding="utf-8"))
-    return {"what": what, **row, "peak memory, MB": worker.peak_bytes / 1e6}
+    paths = (path.absolute() for path in (patient_path, scene_path, output))
+    return {"what": what, **measured(scaling_case.__name__, list(paths))}
 
 
 def read(path: Path) -> list[dict[str, Any]]:

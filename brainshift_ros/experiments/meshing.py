@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,8 +9,8 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from brainshift_ros.experiments import meshing_case
+from brainshift_ros.experiments.own_process import measured
 from brainshift_ros.experiments.results import write_figure, write_results
-from brainshift_ros.worker_process import run_worker
 
 Progress = Callable[[str, float], None]
 
@@ -20,7 +18,6 @@ Progress = Callable[[str, float], None]
 SIZES, LARGE = (2_000, 5_000, 20_000), (50_000, 100_000, 200_000)
 DEFAULT = 20_000
 
-_TIMEOUT_S = 7200.0
 _SMALLEST = 0.02
 _ERRORS = {
     "skull_distance_mm_mean": "brain surface, mean, mm",
@@ -46,7 +43,7 @@ def run(folder: Path, full: bool, progress: Progress) -> dict[str, object]:
     rows: list[dict[str, Any]] = []
     for nodes in (*SIZES, *LARGE) if full else SIZES:
         progress(f"{nodes} nodes", 0.0)
-        rows.append(_measured(nodes))
+        rows.append({"asked": nodes, **measured(meshing_case.__name__, [nodes])})
         progress(f"{nodes} nodes", 1.0)
     summary = {"default": DEFAULT, "rows": rows}
     write_results(folder, summary, rows)
@@ -81,14 +78,3 @@ def chart(rows: list[dict[str, Any]]) -> Figure:
         axes.grid(visible=True, which="both", alpha=0.25)
         axes.legend(fontsize=8)
     return figure
-
-
-def _measured(nodes: int) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory(prefix="brainshift-bench-", ignore_cleanup_errors=True) as folder:
-        made = Path(folder, "row.json")
-        arguments = [str(nodes), str(made)]
-        worker = run_worker(meshing_case.__name__, arguments, Path(folder), timeout_s=_TIMEOUT_S)
-        if worker.status != 0:
-            raise RuntimeError(f"{nodes} nodes: {worker.last_line}")
-        row = json.loads(made.read_text(encoding="utf-8"))
-    return {"asked": nodes, **row, "peak memory, MB": worker.peak_bytes / 1e6}

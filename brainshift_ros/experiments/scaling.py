@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,10 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from brainshift_ros.experiments import scaling_case
+from brainshift_ros.experiments.own_process import measured
 from brainshift_ros.experiments.patients import patient_path, template_patient
 from brainshift_ros.experiments.results import write_figure, write_results
 from brainshift_ros.resources import resource
-from brainshift_ros.worker_process import run_worker
 
 Progress = Callable[[str, float], None]
 
@@ -27,8 +25,6 @@ SCENE = "config/scene_full.yaml"
 
 #: What the issue allows for 20,000 nodes on two quiet cores.
 WALL_LIMIT_S, MEMORY_LIMIT_MB = 60.0, 2500.0
-
-_TIMEOUT_S = 7200.0
 
 
 def run(folder: Path, full: bool, progress: Progress) -> dict[str, object]:
@@ -47,7 +43,9 @@ def run(folder: Path, full: bool, progress: Progress) -> dict[str, object]:
     for nodes in (*SIZES, *LARGE) if full else SIZES:
         template_patient(folder, nodes, 0, progress)
         progress(f"{nodes} nodes: atlas", 0.0)
-        rows.append({"asked": nodes, **_measured(patient_path(folder, nodes, 0))})
+        patient = patient_path(folder, nodes, 0).absolute()
+        figures = measured(scaling_case.__name__, [patient, Path(resource(SCENE)).absolute(), "atlas.h5"])
+        rows.append({"asked": nodes, **figures})
         progress(f"{nodes} nodes: atlas", 1.0)
     exponents = {key: _exponent(rows, key) for key in ("wall, s", "CPU, s", "peak memory, MB")}
     summary: dict[str, object] = {"scene": SCENE, "grows with the number of nodes to the power": exponents, "rows": rows}
@@ -79,17 +77,6 @@ def chart(rows: list[dict[str, Any]]) -> Figure:
         axes.grid(visible=True, which="both", alpha=0.25)
         axes.legend(fontsize=8)
     return figure
-
-
-def _measured(patient: Path) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory(prefix="brainshift-scaling-", ignore_cleanup_errors=True) as folder:
-        made = Path(folder, "row.json")
-        paths = (patient.absolute(), Path(resource(SCENE)).absolute(), Path(folder, "atlas.h5"), made)
-        worker = run_worker(scaling_case.__name__, [str(path) for path in paths], Path(folder), timeout_s=_TIMEOUT_S)
-        if worker.status != 0:
-            raise RuntimeError(f"{patient.name}: {worker.last_line}")
-        row = json.loads(made.read_text(encoding="utf-8"))
-    return {**row, "peak memory, MB": worker.peak_bytes / 1e6}
 
 
 def _exponent(rows: list[dict[str, Any]], key: str) -> float:
