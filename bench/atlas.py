@@ -5,6 +5,7 @@ All in one run, so that the machine's load is the same for all: time, CPU, memor
 
 from __future__ import annotations
 
+import resource
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -95,6 +96,7 @@ def against_refactoring(
                 "wall a set, s": float(np.mean([one.wall_s for one in alone])),
                 "CPU a set, s": float(np.mean([one.cpu_s for one in alone])),
                 "largest relative difference": float(max(differences)),
+                "peak memory of the process so far, MB": _peak_mb(),
                 "solver": model.name,
             }
         )
@@ -119,6 +121,7 @@ def against_ngsolve(patient: PatientModel, scene: Scene) -> list[dict[str, Any]]
             "factorise: wall, s": factorised.wall_s,
             "factorise: CPU, s": factorised.cpu_s,
             "one right-hand side: wall, s": ours.wall_s,
+            "peak memory of the process so far, MB": _peak_mb(),
             "relative difference": 0.0,
         },
         {
@@ -127,9 +130,14 @@ def against_ngsolve(patient: PatientModel, scene: Scene) -> list[dict[str, Any]]
             "factorise: wall, s": peer.times_s["factorise_wall_s"],
             "factorise: CPU, s": peer.times_s["factorise_cpu_s"],
             "one right-hand side: wall, s": peer.times_s["solve_wall_s"],
+            "peak memory of the process so far, MB": peer.peak_bytes / 1e6,
             "relative difference": float(difference),
         },
     ]
+
+
+def _peak_mb() -> float:
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
 def _sample(cases: Sequence[Case]) -> list[Case]:
