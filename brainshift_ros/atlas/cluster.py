@@ -107,10 +107,18 @@ def _as_they_come(
             yield job, solved
 
 
+def _client(address: str) -> Client:
+    try:
+        return Client(address, timeout=CONNECT_S, set_as_default=False, name="brainshift-atlas")
+    except AssertionError:
+        # dask waits ten seconds for its event loop's thread, and was once seen to wait in vain: a second one starts.
+        return Client(address, timeout=CONNECT_S, set_as_default=False, name="brainshift-atlas")
+
+
 @contextmanager
 def _connected(address: str) -> Iterator[Client]:
     try:
-        client = Client(address, timeout=CONNECT_S, set_as_default=False, name="brainshift-atlas")
+        client = _client(address)
     except (OSError, ValueError) as error:
         remedy = "start it with `dask scheduler`, and give the address that it prints"
         raise InputError(address, f"no dask scheduler answers there ({error})", remedy) from error
