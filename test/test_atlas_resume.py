@@ -96,7 +96,7 @@ def test_a_killed_process_resumes(tmp_path, uninterrupted):
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["brainshift_ros.atlas.build", "hypothesis", "pytest"])
     path, chance, kills, kept, process = tmp_path / "atlas.h5", random.Random(3), 0, [], None
-    while process is None or process.exitcode != 0:
+    while not path.exists():
         begun = context.Event()
         process = context.Process(target=build_in_a_process, args=(str(path), begun))
         process.start()
@@ -108,8 +108,9 @@ def test_a_killed_process_resumes(tmp_path, uninterrupted):
         process.join()
         assert process.exitcode in (0, -signal.SIGKILL)
         kills += process.exitcode != 0
-        kept += [jobs_done(path)] if process.exitcode else []
-        assert path.exists() == (process.exitcode == 0)
+        # A kill may also come after the atlas has got its name and before the process has ended: then it is whole (below).
+        kept += [] if path.exists() else [jobs_done(path)]
+        assert path.exists() or process.exitcode != 0
     assert kills >= 2
     assert kept == sorted(kept)  # nothing that was kept is ever lost
     assert_same(path, uninterrupted)
