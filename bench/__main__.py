@@ -10,7 +10,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from bench import atlas, inverse
+from bench import atlas, inverse, scans
 from bench.peers import slip
 from brainshift_ros.atlas.columns import entries_of
 from brainshift_ros.atlas.scene import read_scene
@@ -76,6 +76,10 @@ def main(output: Path, solver: SolverName) -> None:
         results["inverse"] = inverse.run(output / "atlas_demo.h5", patient)
     title = f"inverse from {inverse.POINTS} points, noise {1e3 * inverse.NOISE_M} mm; truth on the atlas's own mesh"
     show(console, title, results["inverse"])
+    with console.status("scans"):
+        results |= scans.run(output, patient)
+    show(console, f"a first and a second scan in process, by stage: medians of {scans.RUNS}", results["scan_stages"])
+    show(console, f"the same through the node lrs: medians of {scans.RUNS}", results["scan_latency"])
     with atomic_path(output / "bench.json") as temporary:
         temporary.write_text(json.dumps(results, indent=1), encoding="utf-8")
     console.print(f"written: {output / 'bench.json'}")

@@ -57,6 +57,7 @@ HOMOLOGOUS_POINTS = Topic(
     PATIENT_FRAME,
     "x y z dx dy dz sigma, all m; empty: not measured",
 )
+DENSE_POINTS = Topic("dense_points", "sensor_msgs/msg/PointCloud2", Qos.LATCHED, PATIENT_FRAME, "x y z dx dy dz sigma, all m")
 RETRACTOR_BLADE = Topic("retractor/blade", "geometry_msgs/msg/PolygonStamped", Qos.RELIABLE, PATIENT_FRAME, "m")
 RETRACTOR_DISPLACEMENT = Topic("retractor/displacement", "geometry_msgs/msg/Vector3Stamped", Qos.RELIABLE, PATIENT_FRAME, "m")
 ATLAS_RETRACTION = Topic(
@@ -82,6 +83,7 @@ TOPICS: tuple[Topic, ...] = (
     REGISTRATION,
     LRS_REGISTERED,
     HOMOLOGOUS_POINTS,
+    DENSE_POINTS,
     RETRACTOR_BLADE,
     RETRACTOR_DISPLACEMENT,
     ATLAS_RETRACTION,
@@ -109,7 +111,7 @@ NODES: tuple[Node, ...] = (
         "lrs",
         "brainshift_ros.nodes.lrs",
         (LRS_POINTS, LRS_INITIAL_POSE),
-        (REGISTRATION, LRS_REGISTERED, HOMOLOGOUS_POINTS, DIAGNOSTICS),
+        (REGISTRATION, LRS_REGISTERED, HOMOLOGOUS_POINTS, DENSE_POINTS, DIAGNOSTICS),
     ),
     Node(
         "retractor",
@@ -127,6 +129,8 @@ NODES: tuple[Node, ...] = (
 
 SERVICES: tuple[Service, ...] = (
     Service("lrs", "reset", "std_srvs/srv/Trigger"),
+    Service("lrs", "guide", "std_srvs/srv/Trigger"),
+    Service("lrs", "dense", "std_srvs/srv/Trigger"),
     Service("retractor", "cancel", "std_srvs/srv/Trigger"),
     Service("inverse", "warp_image", "std_srvs/srv/Trigger"),
 )

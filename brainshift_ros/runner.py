@@ -216,6 +216,9 @@ def case_parameters(
     *,
     image_file: str | Path | None = None,
     output_dir: str | Path | None = None,
+    scene_file: str | Path | None = None,
+    fiducials_file: str | Path | None = None,
+    guides_file: str | Path | None = None,
 ) -> dict[str, dict[str, object]]:
     """Parameters that a case needs, by node; paths become absolute."""
     parameters: dict[str, dict[str, object]] = {
@@ -223,10 +226,16 @@ def case_parameters(
         "lrs": {"patient_file": str(Path(patient_file).resolve())},
         "inverse": {},
     }
-    if image_file is not None:
-        parameters["inverse"]["image_file"] = str(Path(image_file).resolve())
-    if output_dir is not None:
-        parameters["inverse"]["output_dir"] = str(Path(output_dir).resolve())
+    optional = {
+        ("inverse", "image_file"): image_file,
+        ("inverse", "output_dir"): output_dir,
+        ("lrs", "scene_file"): scene_file,
+        ("lrs", "fiducials_file"): fiducials_file,
+        ("lrs", "guides_file"): guides_file,
+    }
+    for (node, name), path in optional.items():
+        if path is not None:
+            parameters[node][name] = str(Path(path).resolve())
     return parameters
 
 

@@ -19,6 +19,9 @@ PROFILE = "FASTDDS_DEFAULT_PROFILES_FILE"
 ARGUMENTS = {
     "atlas": ("atlas_loader", "atlas_file", None, "atlas file (HDF5)"),
     "patient": ("lrs", "patient_file", None, "patient file (HDF5)"),
+    "scene": ("lrs", "scene_file", "", "scene (YAML): a scan without a pose is searched for near its craniotomy"),
+    "fiducials": ("lrs", "fiducials_file", "", "paired fiducials (YAML) that the registration starts from"),
+    "guides": ("lrs", "guides_file", "", "marks in two scans (YAML) that lrs/guide reads"),
     "image": ("inverse", "image_file", "", "T1 MR (NIfTI) for inverse/warp_image"),
     "output_dir": ("inverse", "output_dir", "out/case", "folder that inverse/warp_image writes to"),
 }

@@ -19,7 +19,8 @@ from brainshift_ros.geometry import rigid, transform_points, unit
 from brainshift_ros.mesh.patient import ImageReference, PatientModel
 from brainshift_ros.mesh.patient_file import patient_digest
 from brainshift_ros.mesh.tetmesh import TetMesh
-from brainshift_ros.simulation.scanner import Scanner, make_scene, scanner_pose, take_scan
+from brainshift_ros.simulation.scanner import Scanner, scanner_pose, take_scan
+from brainshift_ros.simulation.scene import make_scene
 from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import affine_mm_to_m
 
@@ -144,6 +145,7 @@ def write_brain_atlas(path, patient):
     return write_columns(path, patient.mesh, brain_fields(patient.mesh.nodes).astype(np.float32), patient.patient_id)
 
 
+@lru_cache
 def brain_scans(shift=brain_shift, scanner=None, seed=3):
     """First and later scan, the true T_patient_tracker, and an initial pose that is 4 degrees and 5 mm off."""
     scene = make_scene(mni_cortex(threshold=0.45), CRANIOTOMY_M, OPENING_M, seed)

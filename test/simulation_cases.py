@@ -14,7 +14,8 @@ from skimage.measure import marching_cubes
 
 from brainshift_ros.geometry import invert_rigid, rigid, transform_points, unit
 from brainshift_ros.registration.target import CortexTarget, prepare_target
-from brainshift_ros.simulation.scanner import Scanner, SimulatedScan, SurgicalScene, make_scene, scanner_pose, take_scan
+from brainshift_ros.simulation.scanner import Scanner, SimulatedScan, scanner_pose, take_scan
+from brainshift_ros.simulation.scene import SurgicalScene, make_scene
 from brainshift_ros.surface.surface import Surface
 from brainshift_ros.units import affine_mm_to_m, m_to_mm, mm_to_m
 

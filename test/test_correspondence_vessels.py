@@ -2,48 +2,19 @@
 
 from __future__ import annotations
 
-import cv2
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from simulation_cases import scan_case
+from vessel_cases import CORTEX, FORK, PIXEL_M, WAVE, flat_scan, sample
 
-from brainshift_ros.correspondence.speculars import repair_speculars, specular_mask
-from brainshift_ros.correspondence.vesselness import blood_contrast, vesselness
-from brainshift_ros.correspondence.vessels import trace_between, trace_vessels
 from brainshift_ros.geometry import transform_points
-from brainshift_ros.registration.scan import OrganisedScan
-
-CORTEX, BLOOD = np.array([190, 130, 110.0]), np.array([110, 25, 25.0])
-PIXEL_M = 0.2e-3
-
-
-def flat_scan(lines, width_px, *, shade=None, glints=(), shape=(240, 320)):
-    """A flat scan with vessels along `lines` of (column, row) points."""
-    cover = np.zeros(shape, np.uint8)
-    for line in lines:
-        cv2.polylines(cover, [np.round(np.array(line) * 16).astype(np.int32)], False, 255, width_px, cv2.LINE_AA, 4)
-    alpha = cv2.GaussianBlur(cover, (0, 0), 0.7).astype(float)[..., None] / 255
-    image = CORTEX * (1 - alpha) + BLOOD * alpha
-    if shade is not None:
-        image = image * shade[..., None]
-    image = image + np.random.default_rng(0).normal(0, 2.0, image.shape)
-    for column, row, radius in glints:
-        cv2.circle(image, (column, row), radius, (250, 248, 245), -1)
-    v, u = np.indices(shape)
-    points = np.stack([u * PIXEL_M, v * PIXEL_M, np.full(shape, 0.3)], axis=-1).astype(np.float32)
-    return OrganisedScan(points, np.clip(image, 0, 255).astype(np.uint8), "tracker", 0)
-
-
-def sample(line, step=1.0):
-    line = np.asarray(line, dtype=float)
-    along = np.r_[0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
-    at = np.arange(0, along[-1], step)
-    return np.stack([np.interp(at, along, line[:, c]) for c in range(2)], axis=-1)
-
-
-WAVE = [(x, 60 + 15 * np.sin(x / 30)) for x in range(20, 300, 2)]
-FORK = [[(40, 170), (160, 150)], [(160, 150), (290, 110)], [(160, 150), (210, 220)]]
+from brainshift_ros.vessels.minimal_path import trace_between
+from brainshift_ros.vessels.speculars import repair_speculars, specular_mask
+from brainshift_ros.vessels.tracing import trace_vessels, vessels_of_points
+from brainshift_ros.vessels.vesselness import blood_contrast, vesselness
 
 
 @pytest.mark.parametrize("width_px", [3, 5, 9])
@@ -68,7 +39,20 @@ def test_the_branch_point_and_the_ends_are_found():
 
 def test_widths_are_the_painted_ones():
     medians = [np.median(np.concatenate([p.width_m for p in trace_vessels(flat_scan([WAVE], w)).paths])) for w in (3, 9)]
-    assert medians == [pytest.approx(3 * PIXEL_M, rel=0.35), pytest.approx(9 * PIXEL_M, rel=0.2)]
+    assert medians == [pytest.approx(3 * PIXEL_M, abs=0.6 * PIXEL_M), pytest.approx(9 * PIXEL_M, abs=PIXEL_M)]
+
+
+def test_a_thin_vessel_beside_a_wide_one_keeps_its_width():
+    wide = [(column, row + 16) for column, row in WAVE]
+    narrow = trace_vessels(flat_scan([WAVE], 3))
+    both = flat_scan([WAVE], 3).rgb.astype(float) * (flat_scan([wide], 9).rgb / CORTEX)
+    tree = trace_vessels(replace(flat_scan([], 3), rgb=np.clip(both, 0, 255).astype(np.uint8)))
+    pixels = np.concatenate([path.pixels for path in tree.paths])
+    width = np.concatenate([path.width_m for path in tree.paths])
+    on_narrow = cKDTree(sample(WAVE)).query(pixels[:, ::-1])[0] < 2.0
+    alone = np.median(np.concatenate([path.width_m for path in narrow.paths]))
+    assert np.median(width[on_narrow]) == pytest.approx(alone, abs=0.6 * PIXEL_M)
+    assert np.median(width[~on_narrow]) > 2.0 * alone
 
 
 def test_a_shadow_is_no_vessel():
@@ -119,7 +103,7 @@ def test_a_given_pair_of_ends_is_joined_along_the_vessel():
 
 
 def test_vessels_of_a_simulated_cortex_are_the_painted_ones():
-    case = scan_case(4)
+    case = scan_case(2, 8.0)
     region = np.isfinite(case.first.current).all(axis=-1)
     tree = trace_vessels(case.first.scan, region)
     traced = np.concatenate([path.pixels for path in tree.paths if not path.bridged]).astype(int)
@@ -137,3 +121,13 @@ def test_no_vessels_no_paths():
     assert tree.paths == ()
     assert tree.branch_points.shape == (0, 2)
     assert tree.length_m == 0.0
+
+
+def test_points_belong_to_the_vessel_they_lie_on():
+    scan = flat_scan([[(20, 40), (300, 40)], [(20, 160), (300, 160)]], 5)
+    tree = trace_vessels(scan)
+    on_first, on_second, nowhere = np.array([[100, 41, 0.3], [200, 158, 0.3], [150, 100, 0.3]]) * [PIXEL_M, PIXEL_M, 1.0]
+    ids = vessels_of_points(tree, scan, np.stack([on_first, on_first + np.array([20e-3, 0, 0]), on_second, nowhere]))
+    assert ids[0] == ids[1] != ids[2]
+    assert ids[3] == -1
+    assert vessels_of_points(trace_vessels(flat_scan([], 3)), scan, on_first[None]).tolist() == [-1]

@@ -15,7 +15,7 @@ SPECIFIED = {
     "atlas_loader": (set(), {"atlas/info", "atlas/surface", "/diagnostics"}),
     "lrs": (
         {"lrs/points", "lrs/initial_pose"},
-        {"registration/patient_from_tracker", "lrs/registered", "homologous_points", "/diagnostics"},
+        {"registration/patient_from_tracker", "lrs/registered", "homologous_points", "dense_points", "/diagnostics"},
     ),
     "retractor": (
         {"retractor/blade", "retractor/displacement"},
@@ -32,6 +32,7 @@ LATCHED = {
     "atlas/surface",
     "registration/patient_from_tracker",
     "homologous_points",
+    "dense_points",
     "atlas/retraction",
     "displacement_field",
 }

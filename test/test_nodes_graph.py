@@ -55,6 +55,8 @@ class Case:
         self.parameters = case_parameters(
             folder / "atlas.h5", folder / "patient.h5", image_file=folder / "t1.nii.gz", output_dir=folder / "warped"
         )
+        # A search would start where a loaded machine lets a pose come late.
+        self.parameters["lrs"]["search_after_s"] = 120.0
         self.running = Graph(self.parameters, domain_id=DOMAIN, sink=lambda name, line: self.lines.append(f"[{name}] {line}"))
 
     def replay(self, *arguments):
@@ -120,6 +122,7 @@ WRONG_SCANS = {
     "its data hold 1000 bytes": lambda scan: changed(scan, data=np.zeros(1000, dtype=np.uint8)),
     "is not organised": lambda scan: changed(scan, height=1, width=76800, row_step=76800 * 16),
     "send metres, not millimetres": millimetres,
+    "its numbers make sense only as little-endian": lambda scan: changed(scan, is_bigendian=True),
 }
 
 

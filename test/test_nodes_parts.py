@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import threading
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from brainshift_ros import graph
 from brainshift_ros.bags import TYPES, to_recordable
 from brainshift_ros.errors import InputError
 from brainshift_ros.nodes.health import Health, Level
+from brainshift_ros.nodes.held_scans import ArrivedScan, HeldScans
 from brainshift_ros.nodes.messages import message_class, to_message
 from brainshift_ros.nodes.qos import PROFILES
 from brainshift_ros.nodes.worker import Worker
@@ -122,6 +124,30 @@ def test_the_worst_condition_speaks_for_the_node():
     assert health.set("points", Level.OK, "1 received") is True
     assert health.set("points", Level.OK, "1 received") is False
     assert health.worst == (Level.WARN, "few points")
+    health.set("atlas", Level.WARN, "another one is announced")
+    assert health.worst == (Level.WARN, "another one is announced"), "of several the latest"
+    health.set("estimate", Level.WARN, "few points")
+    assert health.worst == (Level.WARN, "another one is announced"), "what stays as it was is not news"
+    for name in ("atlas", "estimate"):
+        health.set(name, Level.OK, f"{name} is well")
+    assert health.worst == (Level.OK, "atlas is well")
+    health.report({"time_solve_s": 1.0})
+    health.forget_figures()
+    assert {item["key"] for item in health.status()["values"]} == {"atlas", "points", "estimate"}
+
+
+def test_of_the_scans_that_wait_the_first_and_the_newest_stay():
+    now = [100.0]
+    held = HeldScans(clock=lambda: now[0])
+    nothing = OrganisedScan(np.zeros((2, 2, 3), np.float32), np.zeros((2, 2, 3), np.uint8), "tracker", 1)
+    scans = [ArrivedScan(replace(nothing, stamp_ns=number), 0.0, 0.0) for number in range(4)]
+    assert (held.waited_s(), [held.add(scan) for scan in scans]) == (0.0, [False, False, True, True])
+    now[0] = 103.0
+    assert (len(held), held.waited_s()) == (2, 3.0)
+    assert held.take_first() is scans[0]
+    assert held.waited_s() == 0.0, "the one that stays begins to wait"
+    assert held.take_all() == [scans[3]]
+    assert len(held) == 0
 
 
 class Executor:

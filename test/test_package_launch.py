@@ -95,11 +95,13 @@ def test_it_starts_the_nodes_that_the_runner_starts(entities):
 
 def test_it_sets_the_same_parameters_as_the_runner(entities):
     arguments = {"atlas": "/a.h5", "patient": "/p.h5", "image": "/i.nii.gz", "output_dir": "/out"}
+    arguments |= {"scene": "/s.yaml", "fiducials": "/f.yaml", "guides": "/g.yaml"}
     given = {
         node.name: {name: arguments[value.value.variable_name] for own in node.parameters[1:] for name, value in own.items()}
         for node in of(entities, Node)
     }
-    expected = case_parameters("/a.h5", "/p.h5", image_file="/i.nii.gz", output_dir="/out")
+    files = {"scene_file": "/s.yaml", "fiducials_file": "/f.yaml", "guides_file": "/g.yaml"}
+    expected = case_parameters("/a.h5", "/p.h5", image_file="/i.nii.gz", output_dir="/out", **files)
     assert {name: values for name, values in given.items() if values} == expected
     assert all(value.value_type is str for node in of(entities, Node) for own in node.parameters[1:] for value in own.values())
 
@@ -110,6 +112,9 @@ def test_the_parameter_file_comes_first_so_that_arguments_win(entities):
     assert declared == {
         "atlas": None,
         "patient": None,
+        "scene": "",
+        "fiducials": "",
+        "guides": "",
         "image": "",
         "output_dir": "out/case",
         "params": str(resource("config/nodes.yaml")),

@@ -11,7 +11,8 @@ from simulation_cases import CENTER, DIAMETER_M, SMALL_SCANNER, mni_cortex, scan
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import transform_points
-from brainshift_ros.simulation.scanner import make_scene, scanner_pose, take_scan
+from brainshift_ros.simulation.scanner import scanner_pose, take_scan
+from brainshift_ros.simulation.scene import make_scene
 
 CLEAN = replace(SMALL_SCANNER, range_noise_m=0.0, dropout_fraction=0.0, color_noise=0.0, speculars=False)
 

@@ -34,13 +34,15 @@ def cloud(points, rgb, *, fields, big_endian=False, point_gap=0, row_gap=0, fram
     for row in range(height):
         for column in range(width):
             red, green, blue = (int(value) for value in rgb[row, column])
-            packed = red * 65536 + green * 256 + blue
-            values = dict(zip("xyz", map(float, points[row, column]), strict=True)) | {"r": red, "g": green, "b": blue}
+            packed = {"rgb": red * 65536 + green * 256 + blue, "bgr": blue * 65536 + green * 256 + red}
+            values = dict(zip("xyz", map(float, points[row, column]), strict=True)) | dict(
+                zip("rgb", rgb[row, column], strict=True)
+            )
             for (name, code, _), offset in zip(fields, offsets, strict=True):
                 at = row * row_step + column * step + offset
-                if name in ("rgb", "rgba"):
-                    alpha = 0xFF000000 if name == "rgba" else 0
-                    struct.pack_into(order + "I", data, at, packed | alpha)
+                if name[:3] in packed:
+                    alpha = 0xFF000000 if name.endswith("a") else 0
+                    struct.pack_into(order + "I", data, at, packed[name[:3]] | alpha)
                 else:
                     struct.pack_into(order + code, data, at, values.get(name, 7))
     return SimpleNamespace(
@@ -71,7 +73,9 @@ PLAIN_FIELDS = [("x", "f", 0), ("y", "f", 0), ("z", "f", 0), ("rgb", "f", 4)]
 @st.composite
 def layouts(draw):
     real = draw(st.sampled_from("fd"))
-    colour = draw(st.sampled_from([[("rgb", "f")], [("rgb", "I")], [("rgba", "I")], [("b", "B"), ("g", "B"), ("r", "B")]]))
+    packed = [[(name, code)] for name in ("rgb", "rgba", "bgr", "bgra") for code in "fIi"]
+    separate = [[("b", code), ("g", code), ("r", code)] for code in "Bf"]
+    colour = draw(st.sampled_from([*packed, *separate]))
     others = draw(
         st.lists(st.sampled_from([("intensity", "f"), ("ring", "H"), ("t", "d"), ("q", "b")]), unique=True, max_size=2)
     )
@@ -91,6 +95,30 @@ def test_any_layout_decodes_to_the_same_scan(fields, big_endian, point_gap, row_
     assert (scan.frame_id, scan.stamp_ns) == ("tracker", 12_000_000_034)
     assert not scan.seen[1, 2]
     assert scan.seen.sum() == scan.seen.size - 1
+
+
+def test_separate_floats_are_shares_of_full_brightness_where_none_is_above_one():
+    points, rgb = small_scan()
+    fields = [*PLAIN_FIELDS[:3], ("r", "f", 0), ("g", "f", 0), ("b", "f", 0)]
+    shares = cloud(points, rgb / 255.0, fields=fields)
+    np.testing.assert_array_equal(decode_scan(shares).rgb, rgb)
+    with pytest.raises(InputError, match=r"its colour fields r, g, b run from 0 to 1e\+06"):
+        decode_scan(cloud(points, np.where(rgb == rgb.max(), 1e6, 0.0), fields=fields))
+
+
+@settings(max_examples=40, deadline=None)
+@given(layouts(), st.booleans(), st.booleans(), st.integers(0, 2**32 - 1))
+def test_a_flag_that_lies_about_the_byte_order_is_found_out(fields, big_endian, round_numbers, seed):
+    """Also where the numbers are round: read in the wrong order they are all next to zero, not immense."""
+    points, rgb = small_scan(seed, (5, 6))
+    if round_numbers:
+        points = np.round(points * 16) / 16
+    points[1, 2] = np.nan
+    message = cloud(points, rgb, fields=fields, big_endian=big_endian)
+    message.is_bigendian = not big_endian
+    sense = "big-endian" if big_endian else "little-endian"
+    with pytest.raises(InputError, match=f"its numbers make sense only as {sense}; set is_bigendian"):
+        decode_scan(message)
 
 
 def test_a_point_with_one_bad_coordinate_was_not_seen():
@@ -144,6 +172,12 @@ def moved_field():
     return message
 
 
+def overlapping_field():
+    message = broken()
+    message.fields[2].offset = 6
+    return message
+
+
 def doubled_field():
     message = broken()
     message.fields[1].name = "x"
@@ -178,6 +212,8 @@ FAULTS = {
     "has no colour: its fields are ['x', 'y', 'z']": without_colour,
     "field 'z' ends at byte 23 of a point of 20": moved_field,
     "has 2 fields 'x'": doubled_field,
+    "fields 'y' and 'z' overlap": overlapping_field,
+    "all its points lie within 0 m": lambda: scaled(0.0),
     "field 'x' has datatype 6 (u4)": integer_field,
     "its stamp is -1 s": lambda: broken(header=SimpleNamespace(stamp=SimpleNamespace(sec=-1, nanosec=0), frame_id="tracker")),
 }

@@ -21,6 +21,13 @@ EXPERIMENTS: dict[str, tuple[str, str]] = {
     "septa-gap": ("brainshift_ros.experiments.septa_gap", "What does a gap between septa and skull do to the field?"),
     "consolidation": ("brainshift_ros.experiments.consolidation", "Does consolidation follow its series and stay smooth? (E8)"),
     "mannitol": ("brainshift_ros.experiments.mannitol", "How nearly is a steady field that of a time in surgery? (E7)"),
+    "scans": ("brainshift_ros.experiments.scans", "How accurate are registration and homologous points? (I2, I3)"),
+    "scan-limits": ("brainshift_ros.experiments.scan_limits", "Where do scans fail, and is it said? (E8)"),
+    "basin": ("brainshift_ros.experiments.basin", "From how far off does the registration of a scan find its place? (I2)"),
+    "scan-texture": ("brainshift_ros.experiments.scan_texture", "Would texture hold a scan better than its shape does? (I2)"),
+    "vessels": ("brainshift_ros.experiments.vessels", "Which vessels are found, by which filter, at what cost? (E7)"),
+    "dense-field": ("brainshift_ros.experiments.dense_field", "Is a dense field worth more than its points? (E6)"),
+    "scan-resolution": ("brainshift_ros.experiments.scan_resolution", "What do finer scans bring, and cost in time? (E7)"),
 }
 
 

@@ -18,6 +18,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "compare": ("brainshift_ros.cli.compare", "Automatic labels and septa against a person's."),
     "patient": ("brainshift_ros.cli.patient", "T1 MR -> patient model (segmentation, septa, mesh, tissue)."),
     "atlas": ("brainshift_ros.cli.atlas", "Scene and patient -> atlas of deformations."),
+    "track": ("brainshift_ros.cli.track", "Recorded scans -> homologous points, without ROS."),
     "solve": ("brainshift_ros.cli.solve", "Atlas and sparse points -> displacement field."),
     "warp": ("brainshift_ros.cli.warp", "Displacement field and image -> warped image, ITK transform."),
     "sample": ("brainshift_ros.cli.sample", "Displacement and standard deviation at any points."),

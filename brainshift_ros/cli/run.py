@@ -24,6 +24,15 @@ POLL_S = 0.2
 @click.option("--atlas", "atlas_file", required=True, type=click.Path(path_type=Path), help="atlas file (HDF5)")
 @click.option("--patient", "patient_file", required=True, type=click.Path(path_type=Path), help="patient file (HDF5)")
 @click.option("--image", "image_file", type=click.Path(path_type=Path), help="T1 MR (NIfTI) for the service inverse/warp_image")
+@click.option(
+    "--scene", "scene_file", type=click.Path(path_type=Path), help="scene (YAML): its craniotomy narrows a search for the scan"
+)
+@click.option(
+    "--fiducials", "fiducials_file", type=click.Path(path_type=Path), help="paired fiducials (YAML) to start the registration"
+)
+@click.option(
+    "--guides", "guides_file", type=click.Path(path_type=Path), help="marks in two scans (YAML) for the service lrs/guide"
+)
 @click.option("--output-dir", type=click.Path(path_type=Path), help="where warp_image writes")
 @click.option(
     "--params", "params_files", multiple=True, type=click.Path(path_type=Path), help="ROS 2 parameter file (repeatable)"
@@ -33,15 +42,28 @@ def command(
     atlas_file: Path,
     patient_file: Path,
     image_file: Path | None,
+    scene_file: Path | None,
+    fiducials_file: Path | None,
+    guides_file: Path | None,
     output_dir: Path | None,
     params_files: tuple[Path, ...],
     domain_id: int | None,
 ) -> None:
     """Start atlas_loader, lrs, retractor and inverse; Ctrl-C ends them. A node that ends is started again."""
     _check_case(atlas_file, patient_file, image_file)
+    if scene_file is not None:
+        existing_file(scene_file, "scene (YAML)")
     for path in params_files:
         _check_params(path)
-    parameters = case_parameters(atlas_file, patient_file, image_file=image_file, output_dir=output_dir)
+    parameters = case_parameters(
+        atlas_file,
+        patient_file,
+        image_file=image_file,
+        output_dir=output_dir,
+        scene_file=scene_file,
+        fiducials_file=fiducials_file,
+        guides_file=guides_file,
+    )
     signal.signal(signal.SIGTERM, _interrupt)
     with Graph(parameters, params_files=[path.resolve() for path in params_files], domain_id=domain_id) as running:
         respawner = Respawner(running, lambda line: click.echo(f"brainshift: {line}", err=True))

@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+#: Fewer points do not say which of them is wrong.
+LEAST_POINTS = 6
+
 _NEIGHBOURS = 10
 _REACH_M = 12e-3  # neighbours farther away say less
 _SLACK_M = 0.4e-3  # what an affine fit of the neighbours may miss of a real shift
@@ -30,9 +33,10 @@ def consistent_points(
         Shape (n,).
     """
     kept = np.ones(len(points), dtype=bool)
-    while kept.sum() >= 6:
+    tolerance = np.hypot(np.sqrt(3) * sigma, _SLACK_M)
+    while kept.sum() >= LEAST_POINTS:
         index = np.flatnonzero(kept)
-        score = _misfits(points[index], displacements[index], sigma[index])
+        score = disagreement(points[index], displacements[index]) / tolerance[index]
         worst = score.argmax()
         if score[worst] <= threshold:
             return kept
@@ -41,10 +45,21 @@ def consistent_points(
     return kept
 
 
-def _misfits(
-    points: NDArray[np.float64], displacements: NDArray[np.float64], sigma: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Distance of each displacement from what its neighbours predict, in standard deviations, shape (n,)."""
+def disagreement(points: NDArray[np.float64], displacements: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance of each displacement from what a robust affine fit of its neighbours predicts.
+
+    Parameters
+    ----------
+    points, displacements
+        Shape (n, 3), metres.
+
+    Returns
+    -------
+    distance
+        Shape (n,), metres; NaN where fewer than six points leave nothing to compare with.
+    """
+    if len(points) < LEAST_POINTS:
+        return np.full(len(points), np.nan)
     apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
     np.fill_diagonal(apart, np.inf)
     near = np.argsort(apart, axis=1, kind="stable")[:, : min(_NEIGHBOURS, len(points) - 1)]
@@ -54,13 +69,28 @@ def _misfits(
     base = np.exp(-0.5 * (distance / _REACH_M) ** 2) + 1e-3
     # Gradients are damped: neighbours on one side only must not extrapolate a wild slope.
     ridge = np.diag([1e-6, 0.03, 0.03, 0.03]) * base.sum(axis=1)[:, None, None]
+    # A turn of the whole cortex is no disagreement: it is taken out first, since the damping would keep some of it.
+    displacements = displacements - _trend(points, displacements)
     moved = displacements[near]
     weight = base
     for _ in range(4):
-        weighted = design * weight[..., None]
-        normal = np.einsum("nki,nkj->nij", design, weighted) + ridge
-        fit = np.linalg.solve(normal, np.einsum("nki,nkd->nid", weighted, moved))
+        weighted = (design * weight[..., None]).swapaxes(1, 2)
+        fit = np.linalg.solve(weighted @ design + ridge, weighted @ moved)
         residual = np.linalg.norm(moved - design @ fit, axis=-1)
         scale = np.maximum(1.5 * np.median(residual, axis=1, keepdims=True), 0.3e-3)
         weight = base / (1.0 + (residual / scale) ** 2)
-    return np.linalg.norm(displacements - fit[:, 0], axis=1) / np.hypot(np.sqrt(3) * sigma, _SLACK_M)
+    return np.asarray(np.linalg.norm(displacements - fit[:, 0], axis=1))
+
+
+def _trend(points: NDArray[np.float64], displacements: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Robust affine fit of all displacements, shape (n, 3)."""
+    centred = points - points.mean(axis=0)
+    design = np.column_stack([np.ones(len(points)), centred / _REACH_M])
+    weight = np.ones(len(points))
+    for _ in range(6):
+        weighted = design.T * weight
+        # The damping only settles what a flat patch leaves open: the change with height.
+        fit = np.linalg.solve(weighted @ design + np.diag([0.0, 1e-2, 1e-2, 1e-2]), weighted @ displacements)
+        residual = np.linalg.norm(displacements - design @ fit, axis=1)
+        weight = 1.0 / (1.0 + (residual / max(1.5 * float(np.median(residual)), 0.3e-3)) ** 2)
+    return np.asarray(design @ fit)

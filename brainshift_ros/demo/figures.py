@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from brainshift_ros.correspondence.session import LrsSession
 from brainshift_ros.demo.preparation import Progress
 from brainshift_ros.demo.recording import RecordedCase
 from brainshift_ros.demo.session import Session
@@ -28,6 +27,7 @@ from brainshift_ros.pictures.field import displacement_map, mr_before_after, vec
 from brainshift_ros.pictures.patient_page import patient_page
 from brainshift_ros.pictures.scan import scan_page
 from brainshift_ros.registration.scan import OrganisedScan
+from brainshift_ros.session.session import LrsSession
 from brainshift_ros.units import m_to_mm
 
 
@@ -88,10 +88,10 @@ def _draw_scans(files: DemoFiles, patient: PatientModel, case: RecordedCase, ses
     lrs = LrsSession(patient.cortex)
     lrs.set_initial_pose(case.T_patient_tracker_initial)
     update = lrs.add_scan(case.first.scan)
-    if update.vessels is None:
+    if update.registered is None:
         raise RuntimeError("the first scan was refused outside the graph though the graph accepted it")
     first, later = (_in_patient(scan.scan, session.T_patient_tracker) for scan in (case.first, case.later))
-    scan_page(files.folder / "scan_vessels.png", first, update.vessels, later, session.homologous)
+    scan_page(files.folder / "scan_vessels.png", first, lrs.vessels(), later, session.homologous)
 
 
 def _draw_vectors(files: DemoFiles, patient: PatientModel, session: Session, field: DisplacementField) -> None:

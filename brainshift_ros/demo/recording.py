@@ -15,7 +15,8 @@ from brainshift_ros.demo.settings import DemoFiles, DemoSettings
 from brainshift_ros.geometry import invert_rigid, rigid, transform_points, unit
 from brainshift_ros.mesh.patient import PatientModel
 from brainshift_ros.mesh.template_patient import TemplateImages
-from brainshift_ros.simulation.scanner import Scanner, SimulatedScan, SurgicalScene, make_scene, scanner_pose, take_scan
+from brainshift_ros.simulation.scanner import Scanner, SimulatedScan, scanner_pose, take_scan
+from brainshift_ros.simulation.scene import SurgicalScene, make_scene
 from brainshift_ros.simulation.truth import Truth, direction_between, simulate_truth, smooth_random_field
 from brainshift_ros.surface.cortex import cortical_surface
 from brainshift_ros.surface.surface import Surface

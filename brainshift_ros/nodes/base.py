@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -41,6 +42,8 @@ class BrainshiftNode(Node):
         self.declaration = next(node for node in graph.NODES if node.name == name)
         self.health = Health(name)
         self._publishers_by_topic = {topic.name: self._publisher(topic) for topic in self.declaration.gives}
+        #: When the message that is being handled arrived, by ``time.perf_counter``: before it was deserialised.
+        self.arrived_s = 0.0
         self._workers: list[Worker] = []
         self.worker = self.create_worker()
         self._concurrent = ReentrantCallbackGroup()
@@ -75,6 +78,7 @@ class BrainshiftNode(Node):
         good = itertools.count(1)
 
         def on_bytes(serialised: bytes) -> None:
+            self.arrived_s = time.perf_counter()
             # Deserialising here, not in rclpy, keeps a malformed serialisation from ending the executor.
             try:
                 message = deserialize_message(serialised, kind)

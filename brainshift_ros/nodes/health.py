@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from enum import IntEnum
 
@@ -23,21 +24,33 @@ class Health:
         self._node = node
         self._conditions: dict[str, tuple[Level, str]] = {}
         self._values: dict[str, str] = {}
+        self._changes: dict[str, int] = {}
+        self._count = itertools.count()
 
     def set(self, condition: str, level: Level, message: str) -> bool:
         """Set a condition; True if that changes it."""
         changed = self._conditions.get(condition) != (level, message)
         self._conditions[condition] = (level, message)
+        if changed:
+            self._changes[condition] = next(self._count)
         return changed
 
     def report(self, values: Mapping[str, object]) -> None:
         """Add figures, such as times and counts, to the report."""
         self._values.update({name: str(value) for name, value in values.items()})
 
+    def forget_figures(self) -> None:
+        """Report no figure of before."""
+        self._values.clear()
+
     @property
     def worst(self) -> tuple[Level, str]:
-        """Level and message of the worst condition; the latest set among equals is not preferred."""
-        return max(self._conditions.values(), key=lambda condition: condition[0], default=(Level.OK, "running"))
+        """Level and message of the worst condition: of several faults the latest; where all is well, the first one set."""
+        if not self._conditions:
+            return (Level.OK, "running")
+        level = max(level for level, _ in self._conditions.values())
+        equals = [name for name, condition in self._conditions.items() if condition[0] is level]
+        return self._conditions[equals[0] if level is Level.OK else max(equals, key=self._changes.__getitem__)]
 
     def status(self) -> Plain:
         """Plain DiagnosticStatus: the node's level and message, each condition, and the figures."""

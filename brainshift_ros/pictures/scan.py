@@ -7,20 +7,24 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
+from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from brainshift_ros.correspondence.homologous import HomologousPoints
-from brainshift_ros.correspondence.vessels import VesselTree
 from brainshift_ros.errors import InputError
 from brainshift_ros.files import atomic_path
 from brainshift_ros.registration.opening import pixel_spacing
 from brainshift_ros.registration.scan import OrganisedScan
 from brainshift_ros.units import m_to_mm
+from brainshift_ros.vessels.tracing import VesselTree
 
-_VESSEL, _BRIDGE, _START, _END = "#ffe066", "#7fe3ff", "#ffffff", "#39ff88"
+_VESSEL, _BRIDGE, _START, _END, _OBSTACLE = "#ffe066", "#7fe3ff", "#ffffff", "#39ff88", "#ff4fd8"
+
+#: Standard deviations are drawn this much larger than the picture: true to scale they are about a pixel.
+_SIGMA_SCALE = 5.0
 
 
 def pixels_of(scan: OrganisedScan, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -64,9 +68,11 @@ def scan_page(
     later: OrganisedScan | None = None,
     homologous: HomologousPoints | None = None,
     *,
+    first_obstacles: NDArray[np.bool_] | None = None,
+    later_obstacles: NDArray[np.bool_] | None = None,
     title: str = "Laser range scan of the craniotomy",
 ) -> None:
-    """Draw a scan with its traced vessels and, given a later scan, the motion of its homologous points.
+    """Draw a scan with its traced vessels and, given a later scan, the motion of its homologous points with their sigmas.
 
     Parameters
     ----------
@@ -78,16 +84,21 @@ def scan_page(
         Traced in the first scan.
     later, homologous
         Later scan and the points found in it, same frame.
+    first_obstacles, later_obstacles
+        Shape (H, W): pixels of either scan that are no cortex (instruments, a cavity); outlined.
     title
         Heading of the page.
 
     Raises
     ------
     InputError
-        When only one of `later` and `homologous` is given.
+        When only one of `later` and `homologous` is given, or obstacles are of another picture.
     """
     if (later is None) != (homologous is None):
         raise InputError("scan page", "a later scan without homologous points, or the reverse", "give both or neither")
+    for scan, obstacles in ((first, first_obstacles), (later, later_obstacles)):
+        if obstacles is not None and (scan is None or obstacles.shape != scan.seen.shape):
+            raise InputError("scan page", f"obstacles of shape {obstacles.shape}", "give a mask of the scan's own pixels")
     panels = 1 if later is None else 2
     figure = Figure(figsize=(9.6 * panels, 8.1), facecolor="#101418", layout="constrained")
     FigureCanvasAgg(figure)
@@ -97,9 +108,9 @@ def scan_page(
     view = _view_around(vessels)
     _texture(axes[0], first, f"First scan: {m_to_mm(vessels.length_m):.0f} mm of vessels, {branches} branch points", view)
     _draw_vessels(axes[0], vessels)
+    _draw_obstacles(axes[0], first_obstacles)
     if later is not None and homologous is not None:
-        starts = pixels_of(first, homologous.points)
-        axes[0].plot(*starts.T, "o", ms=5.5, mfc="none", mec=_END, mew=1.4)
+        axes[0].plot(*pixels_of(first, homologous.points).T, "o", ms=5.5, mfc="none", mec=_END, mew=1.4)
         length_mm = m_to_mm(np.linalg.norm(homologous.displacements, axis=1))
         text = f"{len(length_mm)} homologous points"
         if len(length_mm):
@@ -107,7 +118,10 @@ def scan_page(
         corners = first.points[vessels.strength > 0].astype(np.float64)
         outline = pixels_of(later, corners[np.isfinite(corners).all(axis=1)][::50])
         _texture(axes[1], later, f"Later scan: {text}", _box(outline, 0.008 / pixel_spacing(later)))
+        _draw_obstacles(axes[1], later_obstacles)
         _draw_motion(axes[1], later, homologous)
+    legend = _legend(vessels, homologous, first_obstacles, later_obstacles)
+    figure.legend(handles=legend, loc="outside lower center", ncols=len(legend), frameon=False, labelcolor="white", fontsize=11)
     with atomic_path(path) as part:
         figure.savefig(part, dpi=110, facecolor=figure.get_facecolor(), format="png")
 
@@ -147,8 +161,13 @@ def _draw_vessels(axes: Axes, vessels: VesselTree) -> None:
     axes.plot(*vessels.branch_points[:, ::-1].T, ".", color=_VESSEL, ms=6, mec="black", mew=0.4)
 
 
+def _draw_obstacles(axes: Axes, obstacles: NDArray[np.bool_] | None) -> None:
+    if obstacles is not None and obstacles.any():
+        axes.contour(obstacles.astype(float), levels=[0.5], colors=_OBSTACLE, linewidths=1.6)
+
+
 def _draw_motion(axes: Axes, later: OrganisedScan, homologous: HomologousPoints) -> None:
-    """Arrows in the later picture, from where each point was to where it is."""
+    """Arrows in the later picture, from where each point was to where it is, each with a circle of its sigma."""
     start = pixels_of(later, homologous.points)
     end = pixels_of(later, homologous.points + homologous.displacements)
     for a, b in zip(start, end, strict=True):
@@ -156,3 +175,23 @@ def _draw_motion(axes: Axes, later: OrganisedScan, homologous: HomologousPoints)
             style = {"arrowstyle": "-|>", "color": color, "lw": width, "mutation_scale": 10, "shrinkA": 0, "shrinkB": 0}
             axes.annotate("", xy=b, xytext=a, arrowprops=style)
     axes.plot(*start.T, ".", color=_START, ms=4, mec="black", mew=0.3)
+    diameter = 2.0 * _SIGMA_SCALE * homologous.sigma / pixel_spacing(later)
+    for color, width in (("black", 2.2), (_START, 1.1)):
+        circles = EllipseCollection(
+            diameter, diameter, 0.0, units="x", offsets=end, offset_transform=axes.transData,
+            facecolors="none", edgecolors=color, linewidths=width,
+        )  # fmt: skip
+        axes.add_collection(circles)
+
+
+def _legend(vessels: VesselTree, homologous: HomologousPoints | None, *obstacles: NDArray[np.bool_] | None) -> list[Line2D]:
+    handles = [Line2D([], [], color=_VESSEL, marker=".", lw=2, label="vessel, branch point")]
+    if any(path.bridged for path in vessels.paths):
+        handles.append(Line2D([], [], color=_BRIDGE, lw=2, label="gap in a vessel, bridged"))
+    if homologous is not None:
+        sigma = f"its standard deviation, {_SIGMA_SCALE:g} times"
+        handles.append(Line2D([], [], color=_END, marker="o", mfc="none", lw=2, label="homologous point, its motion"))
+        handles.append(Line2D([], [], color=_START, marker="o", mfc="none", ms=11, lw=0, label=sigma))
+    if any(mask is not None and mask.any() for mask in obstacles):
+        handles.append(Line2D([], [], color=_OBSTACLE, lw=2, label="no cortex"))
+    return handles

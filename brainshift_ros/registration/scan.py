@@ -32,4 +32,5 @@ class OrganisedScan:
     @property
     def seen(self) -> NDArray[np.bool_]:
         """Shape (H, W): where all three coordinates are finite."""
-        return np.asarray(np.isfinite(self.points).all(axis=-1))
+        finite = np.isfinite(self.points)
+        return np.asarray(finite[..., 0] & finite[..., 1] & finite[..., 2])  # several times as fast as all(axis=-1)

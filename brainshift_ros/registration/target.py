@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.registration.exposure import open_fraction
+from brainshift_ros.registration.nearest_grid import NearestGrid, make_nearest_grid
 from brainshift_ros.registration.thinning import voxel_means
 from brainshift_ros.surface.surface import Surface
 
@@ -27,11 +28,14 @@ class CortexTarget:
         Shape (n, 3), patient frame, metres; outward unit normals.
     tree
         KD-tree over `points`.
+    grid
+        The nearest of `points` from any place near them, tabulated.
     """
 
     points: NDArray[np.float64]
     normals: NDArray[np.float64]
     tree: cKDTree
+    grid: NearestGrid
 
 
 def prepare_target(cortex: Surface) -> CortexTarget:
@@ -59,7 +63,8 @@ def prepare_target(cortex: Surface) -> CortexTarget:
     exposed = open_fraction(cortex, points, normals) >= _OPEN_FRACTION
     if exposed.sum() < 100:
         raise InputError("cortex surface", "no part of it can be seen from outside", "check that its normals point outward")
-    return CortexTarget(points[exposed], normals[exposed], cKDTree(points[exposed]))
+    points, normals = points[exposed], normals[exposed]
+    return CortexTarget(points, normals, cKDTree(points), make_nearest_grid(points))
 
 
 def _samples(cortex: Surface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -1,4 +1,4 @@
-"""Whether a registration is to be believed: inliers, residual, relief, conditioning, rivals. Convergence is not asked."""
+"""Whether a registration is to be believed: inliers, residual, relief, conditioning, scale, rivals; not convergence."""
 
 from __future__ import annotations
 
@@ -7,16 +7,20 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from brainshift_ros.geometry import transform_points
-from brainshift_ros.registration.opening import pixel_spacing
-from brainshift_ros.registration.scan import OrganisedScan
+from brainshift_ros.registration.following import disc, following_region, plane_residuals
+from brainshift_ros.registration.icp import tukey_weight
+from brainshift_ros.registration.patch import ScanPatch
 from brainshift_ros.registration.target import CortexTarget
 from brainshift_ros.units import m_to_mm
 
-_JUDGED_POINTS = 15_000
 # Errors of an MR surface are alike over about a gyrus: neighbouring points are not independent evidence.
-_CORRELATION_M = 6e-3
+_CORRELATION_M = 8e-3
+_FOLD_M = 4e-3
+_LEAST_BLOCKS = 30
+_SCALED_POINTS, _SCALE_ITERATIONS = 1500, 10
 
 
 @dataclass(frozen=True)
@@ -30,14 +34,18 @@ class Evidence:
     rms_m
         Root mean square of the inliers' distance to the cortex along its normals, metres.
     area_m2
-        Area of the inliers, square metres.
+        Area of the scan that follows the cortex, dropouts within it included, square metres.
     condition
         Condition number of the Hessian, rotations scaled by the patch's radius of gyration.
     relief_ratio
         Residual to the cortex over residual to the best smooth (quadratic) surface. Near one or above: the scan has no
         relief, or the cortex at this place has another, and nothing holds the scan against sliding.
+    scale
+        By what factor the scan would fit best; away from one it is in other units or not calibrated.
+    scale_sigma
+        Standard deviation of `scale`.
     rivals
-        Restarts that fit nearly as well at another place.
+        Other places that fit nearly as well.
     """
 
     inlier_fraction: float
@@ -45,6 +53,8 @@ class Evidence:
     area_m2: float
     condition: float
     relief_ratio: float
+    scale: float
+    scale_sigma: float
     rivals: int
 
 
@@ -52,15 +62,18 @@ class Evidence:
 class Gates:
     """Limits that all must hold."""
 
-    min_inlier_fraction: float = 0.9
-    max_rms_mm: float = 0.62
+    min_inlier_fraction: float = 0.93
+    max_rms_mm: float = 0.5
     min_area_cm2: float = 8.0
     max_condition: float = 300.0
     max_relief_ratio: float = 0.55
+    max_scale_error: float = 0.04
     max_rivals: int = 0
 
     def failures(self, evidence: Evidence) -> tuple[str, ...]:
         """Each failed gate in words, with the figure and the limit."""
+        if evidence.area_m2 == 0.0:
+            return ("no part of it meets the cortex",)
         area_cm2, rms_mm = evidence.area_m2 * 1e4, float(m_to_mm(evidence.rms_m))
         inliers, relief = evidence.inlier_fraction, evidence.relief_ratio
         checks = (
@@ -81,7 +94,11 @@ class Gates:
                 relief <= self.max_relief_ratio,
                 f"the gyri do not match: residual {relief:.2f} of a smooth surface's (most: {self.max_relief_ratio:g})",
             ),
-            (evidence.rivals <= self.max_rivals, f"{evidence.rivals} other places fit nearly as well"),
+            (
+                abs(evidence.scale - 1.0) <= max(self.max_scale_error, 2.0 * evidence.scale_sigma),
+                f"it would fit better scaled by {evidence.scale:.2f}: check the scanner's units and calibration",
+            ),
+            (evidence.rivals <= self.max_rivals, f"it fits nearly as well elsewhere ({evidence.rivals} other places)"),
         )
         return tuple(text for passed, text in checks if not passed)
 
@@ -102,14 +119,86 @@ def skew(v: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def plane_residuals(target: CortexTarget, points: NDArray[np.float64], within_m: float) -> NDArray[np.float64]:
-    """Signed distance of points (n, 3), patient frame, to the nearest cortex point's plane; NaN beyond `within_m`."""
-    distance, index = target.tree.query(points, distance_upper_bound=within_m)
-    found = np.isfinite(distance)
-    residual = np.full(len(points), np.nan)
-    near = index[found]
-    residual[found] = np.einsum("ij,ij->i", points[found] - target.points[near], target.normals[near])
-    return residual
+def judge(
+    patch: ScanPatch,
+    target: CortexTarget,
+    T_patient_tracker: NDArray[np.float64],
+    *,
+    inlier_m: float,
+    surface_bias_m: float,
+    rivals: int,
+    shape: tuple[int, int],
+) -> Judgement:
+    """Gather the evidence for a pose.
+
+    Parameters
+    ----------
+    patch
+        The scan's blocks in the opening.
+    target
+        The cortex.
+    T_patient_tracker
+        The pose to judge.
+    inlier_m
+        Distance of an inlier, metres.
+    surface_bias_m
+        Standard deviation of the cortical surface's common offset along its normals, metres. No residual shows it, since
+        the fit follows it.
+    rivals
+        How many other places fit nearly as well.
+    shape
+        (H, W) of the scan, for the mask.
+    """
+    residual = plane_residuals(target, patch, T_patient_tracker)
+    region = following_region(residual, patch.oriented, patch.spacing_m, inlier_m)
+    used = region & (np.abs(residual) < inlier_m)
+    mask = np.zeros(shape, dtype=bool)
+    if used.sum() < _LEAST_BLOCKS:
+        nothing = Evidence(0.0, float("inf"), 0.0, float("inf"), float("inf"), 1.0, float("inf"), rivals)
+        middle = transform_points(T_patient_tracker, np.nanmean(patch.points, axis=(0, 1)))
+        return Judgement(nothing, np.eye(6), middle, mask)
+    at = transform_points(T_patient_tracker, patch.points[used])
+    normals = target.normals[target.tree.query(at)[1]]
+    rms = float(np.sqrt(np.mean(residual[used] ** 2)))
+    pivot = at.mean(axis=0)
+    jacobian = np.concatenate([np.cross(at - pivot, normals), normals], axis=1)
+    information = jacobian.T @ jacobian
+    gyration = float(np.sqrt(np.mean(np.sum((at - pivot) ** 2, axis=1))))
+    scaling = np.diag([1 / gyration] * 3 + [1.0] * 3)
+    values = np.linalg.eigvalsh(scaling @ information @ scaling)
+    # Residual variance for each independent piece of evidence, not for each block.
+    repeats = max(min(_CORRELATION_M**2 / patch.spacing_m**2, len(at)), 1.0)
+    variance = rms**2 * repeats
+    outlined = _convex_hull(region) & patch.oriented
+    scale, scale_sigma = _best_scale(at, target, inlier_m, variance)
+    evidence = Evidence(
+        inlier_fraction=float(used.sum() / max(outlined.sum(), 1)),
+        rms_m=rms,
+        area_m2=float(region.sum()) * patch.spacing_m**2,
+        condition=float(values[-1] / max(values[0], 1e-12 * values[-1])),
+        relief_ratio=rms / max(_smooth_residual_rms(at), 1e-6),
+        scale=scale,
+        scale_sigma=scale_sigma,
+        rivals=rivals,
+    )
+    inverse = np.linalg.pinv(information)
+    follows = inverse @ jacobian.sum(axis=0) * surface_bias_m
+    covariance = inverse * variance + np.outer(follows, follows)
+    # Folds that the model lacks are cortex too, if they look like it; dura and instruments lie above it.
+    above = residual > inlier_m  # NaN compares false
+    reached = cv2.dilate(region.astype(np.uint8), disc(round(_FOLD_M / patch.spacing_m))) > 0
+    cortex = reached & ~above & np.isfinite(patch.points[..., 0])
+    rows, columns = (size * patch.block for size in region.shape)
+    mask[:rows, :columns] = np.kron(cortex, np.ones((patch.block, patch.block), dtype=bool))
+    return Judgement(evidence, covariance, pivot, mask)
+
+
+def _convex_hull(region: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Fill the convex hull of a region (h, w)."""
+    contours, _ = cv2.findContours(region.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    hull = np.zeros(region.shape, dtype=np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(contours)), 1)
+    return hull > 0
 
 
 def _smooth_residual_rms(points: NDArray[np.float64]) -> float:
@@ -122,82 +211,24 @@ def _smooth_residual_rms(points: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean((z - design @ coefficients) ** 2)))
 
 
-def judge(
-    scan: OrganisedScan,
-    opening: NDArray[np.bool_],
-    target: CortexTarget,
-    T_patient_tracker: NDArray[np.float64],
-    *,
-    inlier_m: float,
-    rivals: int,
-) -> Judgement:
-    """Gather the evidence for a pose.
+def _best_scale(points: NDArray[np.float64], target: CortexTarget, within_m: float, variance: float) -> tuple[float, float]:
+    """Scale of the similarity transform that fits registered points (n, 3) best, by ICP, and its standard deviation.
 
-    Parameters
-    ----------
-    scan, opening
-        The scan and its pixels that look like cortex.
-    target
-        The cortex.
-    T_patient_tracker
-        The pose to judge.
-    inlier_m
-        Distance of an inlier, metres.
-    rivals
-        How many restarts fit nearly as well elsewhere.
+    `variance` is that of an independent residual, over all of the points.
     """
-    stride = max(1, int(np.sqrt(max(opening.sum(), 1) / _JUDGED_POINTS)))
-    points = transform_points(T_patient_tracker, scan.points[::stride, ::stride].astype(np.float64))
-    candidates = opening[::stride, ::stride]
-    residual = np.full(candidates.shape, np.nan)
-    residual[candidates] = plane_residuals(target, points[candidates], 4e-3)
-    inlier = np.abs(residual) < inlier_m  # NaN compares false
-    spacing = pixel_spacing(scan) * stride
-
-    region = _largest_region(inlier, spacing)
-    outline = np.zeros(inlier.shape, dtype=np.uint8)
-    contours, _ = cv2.findContours(region.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    if contours:
-        cv2.fillConvexPoly(outline, cv2.convexHull(np.concatenate(contours)), 1)
-    within = (outline > 0) & candidates
-    used = inlier & region
-    if used.sum() < 30:
-        nothing = Evidence(0.0, float("inf"), 0.0, float("inf"), float("inf"), rivals)
-        return Judgement(nothing, np.eye(6), points[candidates].mean(axis=0), np.zeros(scan.seen.shape, dtype=bool))
-
-    at = points[used]
-    rms = float(np.sqrt(np.mean(residual[used] ** 2)))
-    pivot = at.mean(axis=0)
-    _, index = target.tree.query(at)
-    normals = target.normals[index]
-    jacobian = np.concatenate([np.cross(at - pivot, normals), normals], axis=1)
-    information = jacobian.T @ jacobian
-    gyration = float(np.sqrt(np.mean(np.sum((at - pivot) ** 2, axis=1))))
-    scale = np.diag([1 / gyration] * 3 + [1.0] * 3)
-    values = np.linalg.eigvalsh(scale @ information @ scale)
-    condition = float(values[-1] / max(values[0], 1e-12 * values[-1]))
-    area = float(used.sum()) * spacing**2
-    independent = max(area / _CORRELATION_M**2, 1.0)
-    covariance = np.linalg.pinv(information) * rms**2 * max(len(at) / independent, 1.0)
-    evidence = Evidence(
-        inlier_fraction=float(used.sum() / max(within.sum(), 1)),
-        rms_m=rms,
-        area_m2=area,
-        condition=condition,
-        relief_ratio=rms / max(_smooth_residual_rms(at), 1e-6),
-        rivals=rivals,
-    )
-    height, width = scan.seen.shape
-    mask = cv2.resize(region.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
-    return Judgement(evidence, covariance, pivot, mask & scan.seen)
-
-
-def _largest_region(inlier: NDArray[np.bool_], spacing_m: float) -> NDArray[np.bool_]:
-    """Largest connected part of the inliers, dropouts and glints bridged."""
-    size = 2 * max(1, round(1.5e-3 / spacing_m)) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    closed = cv2.morphologyEx(np.pad(inlier.astype(np.uint8), size), cv2.MORPH_CLOSE, disc)[size:-size, size:-size]
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed)
-    if count < 2:
-        return np.zeros_like(inlier)
-    return labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    step = max(1, len(points) // _SCALED_POINTS)
+    at, scale = points[::step], 1.0
+    for _ in range(_SCALE_ITERATIONS):
+        distance, index = target.tree.query(at, distance_upper_bound=2.0 * within_m)
+        near = np.isfinite(distance)
+        normals, offset = target.normals[index[near]], at[near] - target.points[index[near]]
+        residual = np.einsum("ij,ij->i", offset, normals)
+        pivot = at.mean(axis=0)
+        lever = at[near] - pivot
+        design = np.column_stack([np.cross(lever, normals), normals, np.einsum("ij,ij->i", lever, normals)])
+        weighted = design * tukey_weight(residual, 2.0 * within_m)[:, None]
+        information = weighted.T @ design
+        change = -np.linalg.pinv(information) @ (weighted.T @ residual)
+        turned = Rotation.from_rotvec(change[:3]).apply(at - pivot)
+        at, scale = pivot + change[3:6] + (1.0 + change[6]) * turned, scale * (1.0 + change[6])
+    return float(scale), float(np.sqrt(variance / step * np.linalg.pinv(information)[6, 6]))

@@ -8,26 +8,25 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import invert_rigid, transform_points, unit
 from brainshift_ros.graph import TRACKER_FRAME
 from brainshift_ros.registration.scan import OrganisedScan
-from brainshift_ros.simulation.craniotomy import (
-    Craniotomy,
-    Surround,
-    hull_height,
-    make_surround,
-    place_craniotomy,
-)
-from brainshift_ros.simulation.texture import CortexTexture, paint_texture, smooth_noise
-from brainshift_ros.simulation.vessels import PaintedVessel, grow_vessels
-from brainshift_ros.surface.queries import RayCaster, RayHits
+from brainshift_ros.simulation.cavity import Cavity, cavity_wall
+from brainshift_ros.simulation.craniotomy import Craniotomy
+from brainshift_ros.simulation.instruments import Instrument
+from brainshift_ros.simulation.lighting import Illumination, Lighting, coaxial_lamp, shade, soften
+from brainshift_ros.simulation.scan_parts import Part, RayScene, Seen, Traced
+from brainshift_ros.simulation.scene import SurgicalScene
+from brainshift_ros.simulation.texture import smooth_noise
 from brainshift_ros.surface.surface import Surface
-from brainshift_ros.surface.surfacing import vertex_normals
 
 Displacement = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+_SHADOW_CLEARANCE_M = 0.5e-3
 
 
 @dataclass(frozen=True)
@@ -70,26 +69,6 @@ class Scanner:
 
 
 @dataclass(frozen=True)
-class SurgicalScene:
-    """Everything the scanner can see, before any shift, in the patient frame.
-
-    Attributes
-    ----------
-    cortex
-        Surface around the opening.
-    vertex_ids
-        Shape (V,), index of each vertex in the surface that the scene was made from.
-    """
-
-    cortex: Surface
-    vertex_ids: NDArray[np.intp]
-    craniotomy: Craniotomy
-    surround: Surround
-    texture: CortexTexture
-    vessels: tuple[PaintedVessel, ...]
-
-
-@dataclass(frozen=True)
 class SimulatedScan:
     """A scan and what really was where.
 
@@ -105,6 +84,10 @@ class SimulatedScan:
         Shape (H, W, 3), metres, patient frame: where it is in this scan, without noise; NaN off the cortex.
     specular
         Shape (H, W), strength of the glint, 0 to 1.
+    label
+        Shape (H, W), uint8, values of :class:`Seen`.
+    T_error
+        4x4, tracker frame: the tracker's error in this scan's points.
     """
 
     scan: OrganisedScan
@@ -112,42 +95,8 @@ class SimulatedScan:
     material: NDArray[np.float64]
     current: NDArray[np.float64]
     specular: NDArray[np.float32]
-
-
-def make_scene(cortex: Surface, center: NDArray[np.float64], diameter_m: float, seed: int) -> SurgicalScene:
-    """Open a craniotomy over `cortex`, paint the brain and cover the rest.
-
-    Parameters
-    ----------
-    cortex
-        The true surface, patient frame, metres; edges of 1 to 2 mm or finer show gyri.
-    center, diameter_m
-        Where and how wide the opening is, metres.
-    seed
-        Decides vessels, mottling, edge and drape.
-    """
-    rng = np.random.default_rng(seed)
-    craniotomy = place_craniotomy(cortex, center, diameter_m)
-    local = transform_points(craniotomy.T_craniotomy_patient, cortex.vertices)
-    keep = (np.hypot(local[:, 0], local[:, 1]) < 1.7 * craniotomy.radius_m) & (local[:, 2] > -0.045)
-    faces = cortex.faces[keep[cortex.faces].all(axis=1)]
-    ids = np.unique(faces)
-    if len(ids) < 100:
-        raise InputError("cortex", f"only {len(ids)} vertices around the craniotomy", "give a finer surface or another centre")
-    renumber = np.full(len(cortex.vertices), -1, dtype=np.int32)
-    renumber[ids] = np.arange(len(ids))
-    half_width = 1.4 * craniotomy.radius_m
-    height, hull = hull_height(craniotomy, cortex, half_width)
-    vessels = grow_vessels(craniotomy.radius_m, rng)
-    texture = paint_texture(vessels, hull - height, half_width, rng)
-    return SurgicalScene(
-        cortex=Surface(cortex.vertices[ids], renumber[faces]),
-        vertex_ids=ids.astype(np.intp),
-        craniotomy=craniotomy,
-        surround=make_surround(craniotomy, cortex, rng),
-        texture=texture,
-        vessels=vessels,
-    )
+    label: NDArray[np.uint8]
+    T_error: NDArray[np.float64]
 
 
 def scanner_pose(
@@ -163,13 +112,6 @@ def scanner_pose(
     return T
 
 
-def _interpolate(
-    values: NDArray[np.float64], faces: NDArray[np.int32], hits: RayHits, first_face: int, where: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """Interpolate vertex values at the hit points of the pixels `where`, shape (k, ...); `faces` begin at `first_face`."""
-    return np.einsum("kc,kcd->kd", hits.barycentric[where], values[faces[hits.face[where] - first_face]])
-
-
 def take_scan(
     scene: SurgicalScene,
     T_patient_tracker: NDArray[np.float64],
@@ -179,19 +121,23 @@ def take_scan(
     displacement: Displacement | NDArray[np.float64] | None = None,
     scanner: Scanner | None = None,
     stamp_ns: int = 0,
+    lighting: Lighting | None = None,
+    instruments: tuple[Instrument, ...] = (),
+    cavity: Cavity | None = None,
+    T_error: NDArray[np.float64] | None = None,
 ) -> SimulatedScan:
     """Scan the scene once.
 
     Parameters
     ----------
     scene
-        From :func:`make_scene`.
+        From :func:`brainshift_ros.simulation.scene.make_scene`.
     T_patient_tracker
         4x4, tracker to patient; the scan is delivered in tracker space.
     T_patient_scanner
         4x4, scanner (z forward) to patient, as :func:`scanner_pose` gives it.
     seed
-        Decides noise, dropouts, glints and lighting of this scan.
+        Decides noise, dropouts, glints and, without `lighting`, the light of this scan.
     displacement
         Shift of the cortex: a function of points (n, 3) in metres, or an array (V, 3) over the vertices of the surface
         that the scene was made from. None: no shift.
@@ -199,84 +145,121 @@ def take_scan(
         Optics; :class:`Scanner` by default.
     stamp_ns
         Time of acquisition.
+    lighting
+        The operating lamp; by default a lamp beside the scanner.
+    instruments
+        What lies or is held over the field.
+    cavity
+        Where tissue was taken out; it moves with `displacement`.
+    T_error
+        4x4, tracker frame: an error of the tracker, applied to the delivered points.
     """
     scanner = scanner or Scanner()
     rng = np.random.default_rng(seed)
-    undeformed = scene.cortex.vertices
-    if displacement is None:
-        shift = np.zeros_like(undeformed)
-    elif callable(displacement):
-        shift = np.asarray(displacement(undeformed), dtype=np.float64)
-    else:
-        shift = np.asarray(displacement, dtype=np.float64)[scene.vertex_ids]
-    if shift.shape != undeformed.shape or not np.isfinite(shift).all():
-        raise InputError("displacement", f"shape {shift.shape} or not finite", "give three finite metres for each vertex")
-    displaced = undeformed + shift
-
-    origin = T_patient_scanner[:3, 3]
+    T_error = np.eye(4) if T_error is None else np.asarray(T_error, dtype=np.float64)
+    geometry = RayScene(_parts_of(scene, _displacement(scene, displacement), instruments, cavity))
     rays = scanner.rays() @ T_patient_scanner[:3, :3].T
-    surround, cortex_faces = scene.surround.surface, len(scene.cortex.faces)
-    everything = Surface(
-        np.vstack([displaced, surround.vertices]), np.vstack([scene.cortex.faces, surround.faces + len(displaced)])
+    seen = geometry.trace(T_patient_scanner[:3, 3], rays)
+    cortex, nothing = seen.label == Seen.CORTEX, seen.label == Seen.NOTHING
+
+    in_opening = transform_points(scene.craniotomy.T_craniotomy_patient, seen.material)[..., :2]
+    albedo = scene.texture(in_opening)
+    if cavity is not None:
+        albedo = cavity.stain(albedo, in_opening)
+    colored = ~(cortex | nothing)
+    albedo[colored] = seen.color[colored]
+    illumination = coaxial_lamp(rays, rng) if lighting is None else _lamp(lighting, scene, geometry, seen)
+    rgb, specular = shade(
+        albedo,
+        seen.normal,
+        rays,
+        cortex | (seen.label == Seen.CAVITY),
+        seen.label == Seen.INSTRUMENT,
+        illumination,
+        rng,
+        speculars=scanner.speculars,
+        color_noise=scanner.color_noise,
     )
-    hits = RayCaster(everything).cast(origin, rays)
-    shape = rays.shape[:2]
-    on_surround = hits.face >= cortex_faces
-    on_cortex = (hits.face >= 0) & ~on_surround
-    position, normal, material = (np.full((*shape, 3), np.nan) for _ in range(3))
-    for where, vertices, faces, first_face in (
-        (on_cortex, displaced, scene.cortex.faces, 0),
-        (on_surround, surround.vertices, surround.faces, cortex_faces),
-    ):
-        position[where] = _interpolate(vertices, faces, hits, first_face, where)
-        normal[where] = unit(_interpolate(vertex_normals(vertices, faces), faces, hits, first_face, where))
-    material[on_cortex] = _interpolate(undeformed, scene.cortex.faces, hits, 0, on_cortex)
+    rgb[nothing] = 0
 
-    albedo = scene.texture(transform_points(scene.craniotomy.T_craniotomy_patient, material)[..., :2])
-    albedo[on_surround] = _interpolate(scene.surround.color, surround.faces, hits, cortex_faces, on_surround)
-    rgb, specular = _shade(albedo, normal, rays, scanner, on_cortex, rng)
-    rgb[~(on_cortex | on_surround)] = 0
+    lost = nothing | _lost(scanner, rays, seen.normal, specular, rng)
+    noisy = seen.position + rays * rng.normal(0.0, scanner.range_noise_m, lost.shape)[..., None]
+    noisy[lost] = np.nan
+    points = transform_points(T_error @ invert_rigid(T_patient_tracker), noisy).astype(np.float32)
+    current = np.where(cortex[..., None], seen.position, np.nan)
+    scan = OrganisedScan(points, rgb, TRACKER_FRAME, stamp_ns)
+    return SimulatedScan(scan, T_patient_tracker, seen.material, current, specular, seen.label, T_error)
 
+
+def _parts_of(
+    scene: SurgicalScene, move: Displacement, instruments: tuple[Instrument, ...], cavity: Cavity | None
+) -> list[Part]:
+    """List what the rays can meet, the cortex and its cavity moved."""
+    vertices, faces = scene.cortex.vertices, scene.cortex.faces
+    walls = []
+    if cavity is not None:
+        faces = faces[cavity.uncut_faces(scene.cortex, scene.craniotomy)]
+        wall = cavity_wall(cavity, scene.cortex, scene.craniotomy)
+        walls.append(Part(Seen.CAVITY, Surface(move(wall.surface.vertices), wall.surface.faces), color=wall.color))
+    metal = [
+        Part(Seen.INSTRUMENT, body.surface, color=np.full(body.surface.vertices.shape, body.reflectance))
+        for body in instruments
+    ]
+    cortex = Part(Seen.CORTEX, Surface(move(vertices), faces), before=vertices)
+    return [cortex, Part(Seen.SURROUND, scene.surround.surface, color=scene.surround.color), *walls, *metal]
+
+
+def _displacement(scene: SurgicalScene, displacement: Displacement | NDArray[np.float64] | None) -> Displacement:
+    """Return a function that moves points (n, 3); it refuses a displacement that is not finite or has another shape."""
+    if displacement is None:
+        return lambda points: points
+    if callable(displacement):
+        shift_at = displacement
+    else:
+        # What lies below the cortex goes with the vertex nearest to it.
+        by_vertex = np.asarray(displacement, dtype=np.float64)[scene.vertex_ids]
+        tree = cKDTree(scene.cortex.vertices)
+
+        def shift_at(points: NDArray[np.float64]) -> NDArray[np.float64]:
+            return by_vertex[tree.query(points)[1]]
+
+    def move(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        shift = np.asarray(shift_at(points), dtype=np.float64)
+        if shift.shape != points.shape or not np.isfinite(shift).all():
+            raise InputError("displacement", f"shape {shift.shape} or not finite", "give three finite metres for each vertex")
+        return points + shift
+
+    return move
+
+
+def _lamp(lighting: Lighting, scene: SurgicalScene, geometry: RayScene, seen: Traced) -> Illumination:
+    """Lamp at each pixel: its cone, and shadows by a ray from every second pixel of every second row."""
+    T_craniotomy_patient = scene.craniotomy.T_craniotomy_patient
+    light = lighting.toward_lamp(T_craniotomy_patient[:3, :3].T)
+    lamp = lighting.falloff(transform_points(T_craniotomy_patient, seen.position)[..., :2])
+    if lighting.shadows:
+        at = seen.position[::2, ::2] + _SHADOW_CLEARANCE_M * seen.normal[::2, ::2]
+        known = np.isfinite(at).all(axis=-1)
+        hidden = np.zeros(known.shape, dtype=bool)
+        hidden[known] = geometry.hidden(at[known], light)
+        lamp = lamp * soften(hidden, lamp.shape)
+    return Illumination(light, lamp, lighting)
+
+
+def _lost(
+    scanner: Scanner,
+    rays: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    specular: NDArray[np.float32],
+    rng: np.random.Generator,
+) -> NDArray[np.bool_]:
+    """Pixels without a range: grazing surfaces, random patches, glints."""
+    shape = specular.shape
     facing = np.abs(np.einsum("hwc,hwc->hw", np.nan_to_num(normal), rays))
-    lost = ~(on_cortex | on_surround) | (rng.uniform(size=shape) > np.clip((facing - 0.12) / 0.15, 0.0, 1.0))
+    lost = rng.uniform(size=shape) > np.clip((facing - 0.12) / 0.15, 0.0, 1.0)
     patches = smooth_noise(rng, shape, 0.008 * scanner.width)
     if scanner.dropout_fraction > 0:
         lost |= patches > np.quantile(patches, 1.0 - scanner.dropout_fraction)
     glare = cv2.dilate(specular, np.ones((3, 3), np.uint8))
     lost |= rng.uniform(size=shape) < np.clip((glare - 0.5) * 3.0, 0.0, 0.9)
-    noisy = position + rays * rng.normal(0.0, scanner.range_noise_m, shape)[..., None]
-    noisy[lost] = np.nan
-    points = transform_points(invert_rigid(T_patient_tracker), noisy).astype(np.float32)
-    current = np.where(on_cortex[..., None], position, np.nan)
-    scan = OrganisedScan(points, rgb, TRACKER_FRAME, stamp_ns)
-    return SimulatedScan(scan, T_patient_tracker, material, current, specular)
-
-
-def _shade(
-    albedo: NDArray[np.float32],
-    normal: NDArray[np.float64],
-    rays: NDArray[np.float64],
-    scanner: Scanner,
-    wet: NDArray[np.bool_],
-    rng: np.random.Generator,
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Diffuse light from beside the scanner, Blinn-Phong glints of wet tissue, vignetting, exposure, colour noise."""
-    shape = albedo.shape[:2]
-    n = np.nan_to_num(normal)
-    light = unit(-rays + 0.25 * unit(rng.normal(size=3)))
-    diffuse = 0.35 + 0.65 * np.clip(np.einsum("hwc,hwc->hw", n, light), 0.0, 1.0)
-    specular = np.zeros(shape, dtype=np.float32)
-    if scanner.speculars:
-        # The film of fluid is not as smooth as the surface mesh: its ripples break the glint into spots.
-        ripple = np.stack([smooth_noise(rng, shape, 0.006 * scanner.width) for _ in range(3)], axis=-1)
-        wet_normal = unit(np.where(wet[..., None], n + 0.10 * ripple, [0.0, 0.0, 1.0]))
-        half = unit(light - rays)
-        glint = np.clip(np.einsum("hwc,hwc->hw", wet_normal, half), 0.0, 1.0) ** 400
-        specular = np.where(wet, np.clip(2.2 * glint - 0.6, 0.0, 1.0), 0.0).astype(np.float32)
-    v, u = np.meshgrid(np.linspace(-1, 1, shape[0]), np.linspace(-1, 1, shape[1]), indexing="ij")
-    vignette = 1.0 - 0.18 * (u**2 + v**2)
-    exposure = rng.uniform(0.92, 1.08) * rng.uniform(0.97, 1.03, 3)
-    color = albedo * (diffuse * vignette)[..., None] * exposure + specular[..., None]
-    color = cv2.GaussianBlur(color.astype(np.float32), (0, 0), 0.6 * scanner.width / 640)
-    color += rng.normal(0.0, scanner.color_noise, color.shape)
-    return (255.0 * np.clip(color, 0.0, 1.0)).astype(np.uint8), specular
+    return np.asarray(lost)

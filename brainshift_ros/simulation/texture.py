@@ -85,7 +85,10 @@ def paint_texture(
         box = cv2.boundingRect(alpha)
         window = (slice(box[1], box[1] + box[3]), slice(box[0], box[0] + box[2]))
         cover = cv2.GaussianBlur(alpha[window], (0, 0), 0.8).astype(np.float32)[..., None] / 255.0
-        thin = float(np.clip(vessel.width.max() / 1.5e-3, 0.45, 0.95))  # thin vessels let the cortex shine through
+        width = float(vessel.width.max())
+        thin = float(
+            np.clip(width / 1.5e-3, 0.45 * min(width / 0.4e-3, 1.0), 0.95)
+        )  # thin vessels let the cortex shine through
         color = (_VEIN if vessel.vein else _ARTERY) * rng.uniform(0.85, 1.15)
         image[window] += cover * thin * (color.astype(np.float32) - image[window])
     return CortexTexture(np.clip(image, 0.0, 1.0), _PIXEL_M)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.graph import Topic
@@ -64,11 +64,12 @@ def read_columns(message: Any, kinds: Mapping[str, Sequence[str]], topic: Topic)
     Raises
     ------
     InputError
-        A size lies, or a field is missing, doubled, of another type, an array, or outside the point.
+        A size lies, or a field is missing, doubled, of another type, an array, outside the point, or upon another.
     """
     data = check_layout(message, topic)
     order = ">" if message.is_bigendian else "<"
     columns: dict[str, NDArray[Any]] = {}
+    extents: list[tuple[int, int, str]] = []
     for name, allowed in kinds.items():
         found = [field for field in message.fields if field.name == name]
         if len(found) != 1:
@@ -79,17 +80,27 @@ def read_columns(message: Any, kinds: Mapping[str, Sequence[str]], topic: Topic)
         if kind not in allowed or int(field.count) != 1:
             problem = f"field '{name}' has datatype {field.datatype} ({kind}) and count {field.count}"
             raise InputError(topic.name, problem, f"send it as one {' or '.join(allowed)} a point")
-        if int(field.offset) + int(kind[1]) > int(message.point_step):
-            problem = f"field '{name}' ends at byte {int(field.offset) + int(kind[1])} of a point of {message.point_step}"
+        start, end = int(field.offset), int(field.offset) + int(kind[1])
+        if end > int(message.point_step):
+            problem = f"field '{name}' ends at byte {end} of a point of {message.point_step}"
             raise InputError(topic.name, problem, "send offsets that lie within point_step")
-        columns[name] = np.ndarray(
-            shape=(int(message.height), int(message.width)),
-            dtype=np.dtype(order + kind),
-            buffer=data,
-            offset=int(field.offset),
-            strides=(int(message.row_step), int(message.point_step)),
-        )
+        for other_start, other_end, other in extents:
+            if start < other_end and other_start < end:
+                raise InputError(topic.name, f"fields '{other}' and '{name}' overlap", "send offsets that keep fields apart")
+        extents.append((start, end, name))
+        columns[name] = strided_view(message, data, start, order + kind)
     return columns
+
+
+def strided_view(message: Any, data: NDArray[np.uint8], offset: int, dtype: DTypeLike) -> NDArray[Any]:
+    """Bytes from `offset` on in each point of a checked cloud, as an array of shape (height, width)."""
+    return np.ndarray(
+        shape=(int(message.height), int(message.width)),
+        dtype=np.dtype(dtype),
+        buffer=data,
+        offset=offset,
+        strides=(int(message.row_step), int(message.point_step)),
+    )
 
 
 def plain_cloud(points: NDArray[np.void], frame_id: str, stamp_ns: int, *, is_dense: bool) -> Plain:
@@ -119,6 +130,6 @@ def plain_cloud(points: NDArray[np.void], frame_id: str, stamp_ns: int, *, is_de
         "is_bigendian": False,
         "point_step": step,
         "row_step": step * width,
-        "data": np.frombuffer(points.tobytes(), dtype=np.uint8),
+        "data": np.ascontiguousarray(points).view(np.uint8).reshape(-1),
         "is_dense": is_dense,
     }

@@ -57,10 +57,10 @@ def decode_homologous(message: Any, topic: Topic = HOMOLOGOUS_POINTS) -> Stamped
     return StampedPoints(points, stamp_ns(message, topic))
 
 
-def encode_homologous(measured: HomologousPoints, stamp_ns: int) -> Plain:
-    """Plain PointCloud2 of homologous points."""
+def encode_homologous(measured: HomologousPoints, stamp_ns: int, topic: Topic = HOMOLOGOUS_POINTS) -> Plain:
+    """Plain PointCloud2 of homologous points, or of a dense field, which has the same columns."""
     table = np.column_stack([measured.points, measured.displacements, measured.sigma])
-    return _encode(table, (*_VECTOR, "sigma"), HOMOLOGOUS_POINTS, stamp_ns)
+    return _encode(table, (*_VECTOR, "sigma"), topic, stamp_ns)
 
 
 def encode_withdrawal(stamp_ns: int) -> Plain:

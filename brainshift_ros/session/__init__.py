@@ -1,0 +1,1 @@
+"""One case at the scanner, from scans to homologous points, without ROS."""

@@ -1,0 +1,1 @@
+"""Vessels in the texture of a scan: enhanced, traced, measured."""
