@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from brainshift_ros.correspondence.coarse_match import agreeing, match_features
 from brainshift_ros.correspondence.coverage import far_share
 from brainshift_ros.correspondence.features import Features
-from brainshift_ros.correspondence.obstacles import obstacle_cells
+from brainshift_ros.correspondence.obstacles import find_obstacles
 from brainshift_ros.correspondence.outliers import disagreement
 from brainshift_ros.correspondence.plane_view import PlaneImage
 from brainshift_ros.correspondence.point_sigma import PointEvidence, point_sigma
@@ -111,12 +111,31 @@ def test_metal_drape_blood_and_a_step_are_obstacles_but_vessels_and_shade_are_no
     image = PlaneImage(color.astype(np.float32), np.ones(shape, bool), height.astype(np.float32))
     for lamp in ([1.0, 1.0, 1.0], [1.15, 1.0, 0.8], [0.85, 1.0, 1.2]):
         lit = PlaneImage((image.color * np.array(lamp)).astype(np.float32), image.matte, image.height)
-        obstacles = obstacle_cells(lit, np.ones(shape, bool), CELL_M)
+        obstacles = find_obstacles(lit, np.ones(shape, bool), CELL_M).cells
         for patch in ((40, 80), (120, 160), (200, 240)):
             assert obstacles[patch[0] : patch[1], 150:190].mean() > 0.97
         assert obstacles[:, 249:252].all()
         assert obstacles[:, 10:140].mean() < 0.02
         assert obstacles[:, 270:].mean() < 0.02
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+def test_blood_that_covers_most_of_the_opening_is_not_taken_for_cortex(share):
+    shape = (200, 200)
+    rng = np.random.default_rng(8)
+
+    def image(covered, lamp):
+        color = np.tile(np.array([190.0, 130.0, 110.0]), (*shape, 1))
+        color[: round(covered * shape[0])] = [115.0, 14.0, 14.0]
+        color = color * lamp + rng.normal(0.0, 3.0, color.shape)
+        return PlaneImage(color.astype(np.float32), np.ones(shape, bool), np.zeros(shape, np.float32))
+
+    opening = np.ones(shape, bool)
+    first = find_obstacles(image(0.0, np.ones(3)), opening, CELL_M)
+    assert first.cortex_redness == pytest.approx(np.log(198.0 / 138.0), abs=0.03)
+    assert first.cells.mean() < 0.02
+    later = find_obstacles(image(share, np.array([1.1, 1.0, 0.9])), opening, CELL_M, first.cortex_redness)
+    assert later.cells.mean() == pytest.approx(share, abs=0.03)
 
 
 def test_half_a_square_is_far_from_points_on_one_side():

@@ -15,6 +15,7 @@ from brainshift_ros.errors import InputError
 from brainshift_ros.geometry import invert_rigid, rigid, transform_points
 from brainshift_ros.registration.fiducials import register_fiducials
 from brainshift_ros.registration.fiducials_file import read_fiducials
+from brainshift_ros.resources import resource
 from brainshift_ros.units import m_to_mm, mm_to_m
 
 #: Skin fiducials around a head, and a tumour below them.
@@ -119,6 +120,11 @@ def write(path, **changes):
     ]
     path.write_text(yaml.safe_dump({"fiducials": entries, **changes}), encoding="utf-8")
     return path
+
+
+def test_the_shipped_example_can_be_registered():
+    example = read_fiducials(resource("config/fiducials_example.yaml"))
+    assert 0.0 < register_fiducials(example.tracker, example.patient, example.fle_m).fre_m < 1.5e-3
 
 
 def test_the_file_holds_millimetres(tmp_path):

@@ -19,7 +19,7 @@ from brainshift_ros.correspondence.fine_tracking import NO_TRACKS, FineLimits, t
 from brainshift_ros.correspondence.guides import LEAST_PAIRS, Guides, cells_of_pixels
 from brainshift_ros.correspondence.homologous import HomologousPoints
 from brainshift_ros.correspondence.measured_points import measure_points
-from brainshift_ros.correspondence.obstacles import obstacle_cells
+from brainshift_ros.correspondence.obstacles import find_obstacles
 from brainshift_ros.correspondence.plane_view import PlaneGrid, PlaneView, covered_cells, grid_over, matchable, resample
 from brainshift_ros.errors import InputError
 from brainshift_ros.registration.opening import pixel_spacing
@@ -85,6 +85,8 @@ class FirstView:
         Shape (n, 2), (column, row) in cells: where homologous points are looked for.
     features
         What the coarse match recognises.
+    cortex_redness
+        Colour of the cortex in it, as :func:`~brainshift_ros.correspondence.obstacles.find_obstacles` needs it.
     """
 
     scan: OrganisedScan
@@ -93,6 +95,7 @@ class FirstView:
     region: NDArray[np.bool_]
     candidates: NDArray[np.float64]
     features: Features
+    cortex_redness: float
 
 
 @dataclass(frozen=True)
@@ -145,8 +148,8 @@ def prepare_first(scan: OrganisedScan, cortex_mask: NDArray[np.bool_], options: 
     size = 2 * max(1, round(_CLOSING_M / cell)) + 1
     region = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)) > 0
     image = resample(scan, grid)
-    obstacles = obstacle_cells(image, region, cell)
-    view = matchable(image, obstacles, cell)
+    obstacles = find_obstacles(image, region, cell)
+    view = matchable(image, obstacles.cells, cell)
     candidates = choose_candidates(
         view,
         region,
@@ -157,7 +160,8 @@ def prepare_first(scan: OrganisedScan, cortex_mask: NDArray[np.bool_], options: 
     )
     if len(candidates) < 6:
         raise InputError("first scan", f"{len(candidates)} vessel features on the cortex", "send a sharp, textured scan")
-    return FirstView(scan, grid, view, region & ~obstacles, candidates, find_features(view, region & view.clear, cell))
+    features = find_features(view, region & view.clear, cell)
+    return FirstView(scan, grid, view, region & ~obstacles.cells, candidates, features, obstacles.cortex_redness)
 
 
 def track(
@@ -186,7 +190,8 @@ def track(
     times: dict[str, float] = {}
     with _timed(times, "resample"):
         image = resample(later_scan, first.grid)
-        later = matchable(image, obstacle_cells(image, first.region, cell), cell)
+        obstacles = find_obstacles(image, first.region, cell, first.cortex_redness)
+        later = matchable(image, obstacles.cells, cell)
     with _timed(times, "coarse"):
         guide_cells = None if guides is None else _guide_cells(first, later_scan, guides)
         coarse = coarse_field(

@@ -13,7 +13,7 @@ from brainshift_ros.errors import InputError
 from brainshift_ros.units import mm_to_m
 from brainshift_ros.yaml_files import read_yaml, validated
 
-_EXAMPLE = "docs/scans.md"
+_EXAMPLE = "config/fiducials_example.yaml"
 
 _Point = tuple[float, float, float]
 
@@ -53,16 +53,7 @@ class PairedFiducials(NamedTuple):
 
 
 def read_fiducials(path: str | Path) -> PairedFiducials:
-    """Read paired fiducials from YAML, millimetres.
-
-    Examples
-    --------
-    ::
-
-        fiducials:
-          - {name: nasion, patient_mm: [0.5, 88.0, -30.2], tracker_mm: [412.1, -80.3, 1201.7]}
-          - ...
-        fle_mm: 1.0   # optional: localisation error of a fiducial, both frames together
+    """Read paired fiducials from YAML, millimetres, as in ``config/fiducials_example.yaml``.
 
     Raises
     ------
