@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from brainshift_ros.correspondence.guides_file import read_guides
+from brainshift_ros.correspondence.tracking import TrackingOptions
 from brainshift_ros.files import writable_target
 from brainshift_ros.inverse.points_csv import write_homologous_points
 from brainshift_ros.mesh.patient_file import read_patient
@@ -15,7 +16,7 @@ from brainshift_ros.registration.fiducials import register_fiducials
 from brainshift_ros.registration.fiducials_file import read_fiducials
 from brainshift_ros.session.bag import track_bag
 from brainshift_ros.session.planned_area import planned_area
-from brainshift_ros.session.session import LrsSession
+from brainshift_ros.session.session import LrsOptions, LrsSession
 from brainshift_ros.units import mm_to_m
 
 _FILE = click.Path(path_type=Path)
@@ -28,6 +29,8 @@ _FILE = click.Path(path_type=Path)
 @click.option("--fiducials", type=_FILE, help="Paired fiducials (YAML, mm) to start from, rather than from the bag's pose.")
 @click.option("--scene", type=_FILE, help="Scene (YAML): without fiducials and pose, search only near its craniotomy.")
 @click.option("--guides", type=_FILE, help="A person's marks (YAML, pixels) in the first and in the last scan.")
+@click.option("--tracker-mm", type=click.FloatRange(0.0, 5.0), default=TrackingOptions.tracker_mm, show_default=True,
+              help="RMS error of the scanner's tracked position, mm; a part of sigma.")  # fmt: skip
 @click.option("--page", type=_FILE, help="Picture to write (PNG): both scans, vessels, motion of the points.")
 @click.option("--dense", "dense_mm", type=click.FloatRange(1.0, 20.0),
               help="Also write a dense field of this spacing in mm, beside OUTPUT with _dense in its name; its sigma "
@@ -39,6 +42,7 @@ def command(
     fiducials: Path | None,
     scene: Path | None,
     guides: Path | None,
+    tracker_mm: float,
     page: Path | None,
     dense_mm: float | None,
 ) -> None:
@@ -60,7 +64,8 @@ def command(
         given = read_fiducials(fiducials)
         start = register_fiducials(given.tracker, given.patient, given.fle_m)
     near = None if scene is None else planned_area(scene)
-    session = LrsSession(read_patient(patient).cortex, near=near)
+    options = LrsOptions(tracking=TrackingOptions(tracker_mm=tracker_mm))
+    session = LrsSession(read_patient(patient).cortex, options, near=near)
 
     tracked = track_bag(session, bag, lambda name, line: click.echo(f"{name}: {line}"), fiducials=start, marks=marks)
     write_homologous_points(output, tracked.homologous)

@@ -16,6 +16,7 @@ from rclpy.task import Future
 
 from brainshift_ros.correspondence.dense import DenseField
 from brainshift_ros.correspondence.guides_file import read_guides
+from brainshift_ros.correspondence.tracking import TrackingOptions
 from brainshift_ros.errors import InputError
 from brainshift_ros.files import Signature, signature_of
 from brainshift_ros.graph import DENSE_POINTS, LRS_INITIAL_POSE, LRS_POINTS
@@ -27,7 +28,7 @@ from brainshift_ros.nodes.lrs_output import POINTS, POSE, SCAN, LrsOutput
 from brainshift_ros.registration.fiducials import register_fiducials
 from brainshift_ros.registration.fiducials_file import read_fiducials
 from brainshift_ros.session.planned_area import planned_area
-from brainshift_ros.session.session import LrsSession, LrsUpdate
+from brainshift_ros.session.session import LrsOptions, LrsSession, LrsUpdate
 from brainshift_ros.units import mm_to_m
 from brainshift_ros.wire.pose import decode_pose
 from brainshift_ros.wire.scan import decode_scan
@@ -84,6 +85,8 @@ class LrsNode(BrainshiftNode):
         )
         waits = "s that a first scan waits for a pose before the cortex is searched for it; below 0: it waits for ever"
         self._search_after_s = self.parameter("search_after_s", 3.0, waits, (-1.0, 3600.0))
+        error = "mm, RMS error of the scanner's tracked position; a part of every point's sigma"
+        self._tracker_mm = self.parameter("tracker_mm", TrackingOptions.tracker_mm, error, (0.0, 5.0))
         self._dense_spacing_mm = self.parameter(
             "dense_spacing_mm", 2.0, "mm between the points that ~/dense publishes", (1.0, 20.0)
         )
@@ -130,7 +133,8 @@ class LrsNode(BrainshiftNode):
             raise InputError("patient_file", "is not set", remedy)
         if self._session is None:
             near = planned_area(self._scene_file) if self._scene_file else None
-            self._session = LrsSession(read_patient(self._patient_file).cortex, near=near)
+            options = LrsOptions(tracking=TrackingOptions(tracker_mm=self._tracker_mm))
+            self._session = LrsSession(read_patient(self._patient_file).cortex, options, near=near)
 
     def _load_fiducials(self) -> None:
         path = self._fiducials_file
