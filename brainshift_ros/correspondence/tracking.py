@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -24,6 +22,7 @@ from brainshift_ros.correspondence.plane_view import PlaneGrid, PlaneView, cover
 from brainshift_ros.errors import InputError
 from brainshift_ros.registration.opening import pixel_spacing
 from brainshift_ros.registration.scan import OrganisedScan
+from brainshift_ros.timing import timed
 from brainshift_ros.units import m_to_mm, mm_to_m
 
 _CLOSING_M = 2.5e-3  # dropouts in the mask of the cortex
@@ -188,11 +187,11 @@ def track(
     options = options or TrackingOptions()
     cell = first.grid.cell_m
     times: dict[str, float] = {}
-    with _timed(times, "resample"):
+    with timed(times, "resample"):
         image = resample(later_scan, first.grid)
         obstacles = find_obstacles(image, first.region, cell, first.cortex_redness)
         later = matchable(image, obstacles.cells, cell)
-    with _timed(times, "coarse"):
+    with timed(times, "coarse"):
         guide_cells = None if guides is None else _guide_cells(first, later_scan, guides)
         coarse = coarse_field(
             first.features,
@@ -203,7 +202,7 @@ def track(
             least_matches=options.least_matches,
             guides=guide_cells,
         )
-    with _timed(times, "fine"):
+    with timed(times, "fine"):
         candidates = first.candidates
         if guide_cells is not None:
             spacing = float(mm_to_m(options.spacing_mm)) / cell
@@ -214,7 +213,7 @@ def track(
             least_correlation=options.least_correlation,
         )
         tracks = NO_TRACKS if coarse.field is None else track_twice(first.view, later, candidates, coarse.field, limits, cell)
-    with _timed(times, "lift"):
+    with timed(times, "lift"):
         found = measure_points(first.view, later, first.grid, tracks, tracker_m=float(mm_to_m(options.tracker_mm)))
     kept = found.tracks
     far = far_share(first.region, kept.start, cell)
@@ -233,13 +232,6 @@ def track(
         warnings=_warnings(len(found.points.points), far, coarse),
         times_s=times,
     )
-
-
-@contextmanager
-def _timed(times: dict[str, float], stage: str) -> Iterator[None]:
-    clock = time.perf_counter()
-    yield
-    times[stage] = time.perf_counter() - clock
 
 
 def _guide_cells(first: FirstView, later_scan: OrganisedScan, guides: Guides) -> Pairs:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +19,7 @@ from brainshift_ros.registration.search import SearchArea
 from brainshift_ros.registration.target import CortexTarget, prepare_target
 from brainshift_ros.registration.verdict import judge
 from brainshift_ros.surface.surface import Surface
+from brainshift_ros.timing import timed
 from brainshift_ros.units import m_to_mm, mm_to_m
 
 _LARGE_CORRECTION_MM = 12.0
@@ -68,45 +67,42 @@ def register_scan(
     as the best, the result is refused.
     """
     options = options or RegistrationOptions()
-    clock = time.perf_counter()
-    check_scan(scan)
-    initial = None if T_patient_tracker_initial is None else check_pose(T_patient_tracker_initial)
-    target = cortex if isinstance(cortex, CortexTarget) else prepare_target(cortex)
-    patch = scan_patch(scan, opening_mask(scan), float(mm_to_m(options.spacing_mm)))
-    cloud = patch.cloud()
-    if len(cloud.points) < _LEAST_POINTS:
-        raise InputError("scan", "its points are too scattered over the picture", "send a dense organised scan")
-    middle = cloud.points.mean(axis=0)
-    times = {"prepare": time.perf_counter() - clock}
-
-    clock = time.perf_counter()
-    places = places_over(patch, target, near, options) if initial is None else places_around(patch, target, initial, options)
-    times["coarse"] = time.perf_counter() - clock
-
-    clock = time.perf_counter()
-    T, iterations = refine(patch, target, places.candidates.poses[0], options)
-    times["fine"] = time.perf_counter() - clock
-
-    clock = time.perf_counter()
-    judged = judge(
-        patch,
-        target,
-        T,
-        inlier_m=float(mm_to_m(options.inlier_mm)),
-        surface_bias_m=float(mm_to_m(options.surface_bias_mm)),
-        rivals=places.candidates.rivals(options.rival_ratio),
-        shape=scan.points.shape[:2],
-    )
-    reasons = options.gates.failures(judged.evidence)
-    warnings = []
-    if not reasons and initial is not None:
-        correction_mm = float(m_to_mm(np.linalg.norm(transform_points(T, middle) - transform_points(initial, middle))))
-        if correction_mm > _LARGE_CORRECTION_MM:
-            warnings.append(f"registration moved the scan by {correction_mm:.0f} mm from its initial pose: check the pose")
-    elif reasons:
-        fault = handedness_fault(patch, target, _where_to_look(near, initial, middle, target), options)
-        reasons = reasons if fault is None else (fault, *reasons)
-    times["verdict"] = time.perf_counter() - clock
+    times: dict[str, float] = {}
+    with timed(times, "prepare"):
+        check_scan(scan)
+        initial = None if T_patient_tracker_initial is None else check_pose(T_patient_tracker_initial)
+        target = cortex if isinstance(cortex, CortexTarget) else prepare_target(cortex)
+        patch = scan_patch(scan, opening_mask(scan), float(mm_to_m(options.spacing_mm)))
+        cloud = patch.cloud()
+        if len(cloud.points) < _LEAST_POINTS:
+            raise InputError("scan", "its points are too scattered over the picture", "send a dense organised scan")
+        middle = cloud.points.mean(axis=0)
+    with timed(times, "coarse"):
+        if initial is None:
+            places = places_over(patch, target, near, options)
+        else:
+            places = places_around(patch, target, initial, options)
+    with timed(times, "fine"):
+        T, iterations = refine(patch, target, places.candidates.poses[0], options)
+    with timed(times, "verdict"):
+        judged = judge(
+            patch,
+            target,
+            T,
+            inlier_m=float(mm_to_m(options.inlier_mm)),
+            surface_bias_m=float(mm_to_m(options.surface_bias_mm)),
+            rivals=places.candidates.rivals(options.rival_ratio),
+            shape=scan.points.shape[:2],
+        )
+        reasons = options.gates.failures(judged.evidence)
+        warnings = []
+        if not reasons and initial is not None:
+            correction_mm = float(m_to_mm(np.linalg.norm(transform_points(T, middle) - transform_points(initial, middle))))
+            if correction_mm > _LARGE_CORRECTION_MM:
+                warnings.append(f"registration moved the scan by {correction_mm:.0f} mm from its initial pose: check the pose")
+        elif reasons:
+            fault = handedness_fault(patch, target, _where_to_look(near, initial, middle, target), options)
+            reasons = reasons if fault is None else (fault, *reasons)
     return RegistrationResult(
         T_patient_tracker=T,
         accepted=not reasons,

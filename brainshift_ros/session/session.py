@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,6 +27,7 @@ from brainshift_ros.registration.target import CortexTarget, prepare_target
 from brainshift_ros.registration.thinning import voxel_means
 from brainshift_ros.session.report import Figures, registration_figures, tracking_figures
 from brainshift_ros.surface.surface import Surface
+from brainshift_ros.timing import timed
 from brainshift_ros.units import m_to_mm, mm_to_m
 from brainshift_ros.vessels.tracing import VesselTree, trace_vessels
 
@@ -198,10 +197,10 @@ class LrsSession:
             When the scan is unusable; the session goes on as if it had not come.
         """
         times: dict[str, float] = {}
-        with _timed(times, "check"):
+        with timed(times, "check"):
             check_scan(scan)
         if self._registration is not None:
-            with _timed(times, "place"):
+            with timed(times, "place"):
                 registered = _in_patient(scan, self._registration)
             self._later_scan, self._compared = scan, False
             self._later_scans += 1
@@ -304,7 +303,7 @@ class LrsSession:
         if not result.accepted:
             refused = tuple(f"registration refused: {reason}" for reason in result.reasons)
             return LrsUpdate(registration=result, warnings=refused, diagnostics=figures, times_s=times)
-        with _timed(times, "place"):
+        with timed(times, "place"):
             registered = _in_patient(scan, result)
         self._registration, self._first_scan, self._pending = result, scan, None
         return LrsUpdate(result, registered, warnings=result.warnings, diagnostics=figures, times_s=times)
@@ -313,7 +312,7 @@ class LrsSession:
         assert self._first_scan is not None
         assert self._registration is not None
         try:
-            with _timed(times, "candidates"):
+            with timed(times, "candidates"):
                 return prepare_first(self._first_scan, self._registration.cortex_mask, self._options.tracking)
         except InputError:
             self._initial = self._registration.T_patient_tracker
@@ -346,13 +345,6 @@ class LrsSession:
             kept = "the registration is kept; reset the case if the tracker's reference has moved"
             warnings = (f"the {what} disagrees with the registration by {apart_mm:.0f} mm: {kept}",)
         return LrsUpdate(self._registration, warnings=warnings, diagnostics={f"{what}_disagreement_mm": apart_mm})
-
-
-@contextmanager
-def _timed(times: dict[str, float], stage: str) -> Iterator[None]:
-    clock = time.perf_counter()
-    yield
-    times[stage] = time.perf_counter() - clock
 
 
 def _in_patient(scan: OrganisedScan, registration: RegistrationResult) -> OrganisedScan:
