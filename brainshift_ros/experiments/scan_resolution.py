@@ -155,5 +155,5 @@ def _times(axes: Axes, at: Sequence[float], mean: Sequence[Row]) -> None:
         axes.plot(at, [row[f"{stage}_s"] for row in mean], ".:", label=f"of it {stage}, wall s")
     axes.axhline(1.0, color="tab:red", linewidth=0.8)
     axes.set_title("time; red: 1 s", fontsize=9)
-    axes.set_ylim(0.0, 1.6 * max(1.0, *(row["later_cpu_s"] for row in mean)))
+    axes.set_ylim(0.0, 2.2 * max(1.0, *(row["later_cpu_s"] for row in mean)))
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 0.94))
