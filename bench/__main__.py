@@ -10,7 +10,9 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from bench import atlas, inverse, scans
+from bench import atlas, fields, inverse, scans
+from bench.images import SIZE as IMAGE_SIZE
+from bench.images import run as run_images
 from bench.peers import slip
 from brainshift_ros.atlas.columns import entries_of
 from brainshift_ros.atlas.scene import read_scene
@@ -76,6 +78,21 @@ def main(output: Path, solver: SolverName) -> None:
         results["inverse"] = inverse.run(output / "atlas_demo.h5", patient)
     title = f"inverse from {inverse.POINTS} points, noise {1e3 * inverse.NOISE_M} mm; truth on the atlas's own mesh"
     show(console, title, results["inverse"])
+    with console.status("from points to weights"):
+        results["points_to_weights"] = inverse.points_to_weights(output / "atlas.h5")
+    show(console, "from points to weights, atlas of full size", results["points_to_weights"])
+    with console.status("fields"):
+        results |= fields.run(output / "atlas.h5")
+    show(
+        console,
+        f"from points to the displacement field in process, by stage: medians of {fields.RUNS}",
+        results["field_stages"],
+    )
+    show(console, f"the same through the node inverse: medians of {fields.RUNS}", results["field_latency"])
+    with console.status("images"):
+        results |= run_images(patient, scene)
+    show(console, f"warping {IMAGE_SIZE}^3 voxels, the brain's shift and the image in memory", results["warp"])
+    show(console, "what the transform file loses between its voxels", results["transform"])
     with console.status("scans"):
         results |= scans.run(output, patient)
     show(console, f"a first and a second scan in process, by stage: medians of {scans.RUNS}", results["scan_stages"])

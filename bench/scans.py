@@ -142,12 +142,12 @@ class _Lap:
 
 def _lap(client: ScanClient, case: ScanCase, pid: int) -> _Lap:
     begin = cpu_seconds(pid)
-    registered = client.seconds_to(graph.LRS_REGISTERED, replace(case.first.scan, stamp_ns=NS_PER_S))
+    registered = client.seconds_to_answer(graph.LRS_REGISTERED, replace(case.first.scan, stamp_ns=NS_PER_S))
     registered_cpu = cpu_seconds(pid) - begin
     client.wait_for_figure("scans_registered", 1)
     client.figure("candidates")  # the first scan is prepared for comparison
     begin = cpu_seconds(pid)
-    points = client.seconds_to(graph.HOMOLOGOUS_POINTS, replace(case.later.scan, stamp_ns=2 * NS_PER_S))
+    points = client.seconds_to_answer(graph.HOMOLOGOUS_POINTS, replace(case.later.scan, stamp_ns=2 * NS_PER_S))
     points_cpu = cpu_seconds(pid) - begin
     client.wait_for_figure("scans_compared", 1)
     return _Lap(registered, registered_cpu, client.figure("time_message_to_registered_s"), points, points_cpu)

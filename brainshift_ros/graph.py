@@ -61,7 +61,11 @@ DENSE_POINTS = Topic("dense_points", "sensor_msgs/msg/PointCloud2", Qos.LATCHED,
 RETRACTOR_BLADE = Topic("retractor/blade", "geometry_msgs/msg/PolygonStamped", Qos.RELIABLE, PATIENT_FRAME, "m")
 RETRACTOR_DISPLACEMENT = Topic("retractor/displacement", "geometry_msgs/msg/Vector3Stamped", Qos.RELIABLE, PATIENT_FRAME, "m")
 ATLAS_RETRACTION = Topic(
-    "atlas/retraction", "std_msgs/msg/Float32MultiArray", Qos.LATCHED, PATIENT_FRAME, "m; columns x nodes x xyz"
+    "atlas/retraction",
+    "std_msgs/msg/Float32MultiArray",
+    Qos.LATCHED,
+    PATIENT_FRAME,
+    "m; columns x nodes x xyz; the second dimension's label: `nodes of PATIENT_ID`",
 )
 RETRACTOR_STATUS = Topic(
     "retractor/status", "diagnostic_msgs/msg/DiagnosticStatus", Qos.LATCHED, None, "stage, progress 0..1, times in s"
@@ -72,7 +76,7 @@ DISPLACEMENT_FIELD = Topic(
 DISPLACEMENT_MARKERS = Topic(
     "displacement_markers", "visualization_msgs/msg/MarkerArray", Qos.LATCHED, PATIENT_FRAME, "m; colours by mm"
 )
-SHIFT_ESTIMATE = Topic("shift_estimate", "std_msgs/msg/String", Qos.LATCHED, None, "JSON, schema brainshift/shift-estimate/1")
+SHIFT_ESTIMATE = Topic("shift_estimate", "std_msgs/msg/String", Qos.LATCHED, None, "JSON, schema brainshift/shift-estimate/2")
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", Qos.DIAGNOSTICS, None, "")
 
 TOPICS: tuple[Topic, ...] = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import shutil
 from importlib.resources import files
 from pathlib import Path
@@ -17,6 +18,7 @@ from hypothesis import strategies as st
 from mechanics_cases import head, patient
 
 from brainshift_ros.atlas.columns import entries_of, groups_of
+from brainshift_ros.atlas.contiguous import read_columns
 from brainshift_ros.atlas.diagnostics import DIAGNOSTICS
 from brainshift_ros.atlas.file import BLOCK_NODES, AtlasContent, open_atlas, write_atlas
 from brainshift_ros.atlas.scene import Gravity, Mannitol, Scene, Swelling
@@ -158,6 +160,22 @@ def test_cut_off_files_are_refused(copy, share):
     Path(copy).write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(InputError, match="cut off"):
         open_atlas(copy)
+
+
+def test_a_file_cut_short_while_it_is_open_is_an_error(copy):
+    with open_atlas(copy) as atlas:
+        os.truncate(copy, os.path.getsize(copy) // 2)
+        with pytest.raises(InputError, match="cannot be read"):
+            atlas.columns([0, 1])
+
+
+@pytest.mark.parametrize("stored", [{}, {"chunks": (64, 3, 8)}, {"dtype": ">f4"}])
+def test_columns_are_those_of_hdf5_however_they_are_stored(tmp_path, stored):
+    ids = np.array([5, 2, 5, E.shape[2] - 1])
+    with h5py.File(tmp_path / "matrix.h5", "w") as file:
+        matrix = file.create_dataset("E", data=E, **stored)
+        file.flush()
+        np.testing.assert_array_equal(read_columns(matrix, ids), matrix[()][:, :, ids])
 
 
 def damage(name):

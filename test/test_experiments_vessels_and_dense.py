@@ -13,7 +13,7 @@ from brainshift_ros.correspondence.dense import DenseField, interpolate
 from brainshift_ros.correspondence.error_growth import ErrorGrowth
 from brainshift_ros.correspondence.homologous import HomologousPoints
 from brainshift_ros.experiments.dense_field import chart, summary_of
-from brainshift_ros.experiments.dense_field_inverse import METHODS, solve_correlated
+from brainshift_ros.experiments.dense_field_inverse import METHODS
 from brainshift_ros.experiments.dense_field_scans import Interpolated, summary, table
 from brainshift_ros.experiments.skull_cases import SKULLS, build_memory_atlas
 from brainshift_ros.experiments.vessels_score import DRAWN_WIDER_M, PaintedTruth, score_tree
@@ -120,19 +120,26 @@ def dense(small_atlas):
     return interpolate(measured, np.unique(atlas.mesh.nodes[near], axis=0)), truth
 
 
+#: Every point counts: an outlier would hide what the weights do.
+ALL_POINTS = InverseOptions(outlier_sigmas=1e6)
+
+
 def test_without_correlation_the_covariance_is_the_sigmas(small_atlas, dense):
-    field, _ = dense
-    alone = _without_correlation(field)
-    by_covariance = solve_correlated(*small_atlas, alone, 0.0)
-    options = InverseOptions(outlier_sigmas=1e6)
-    by_sigma = estimate_shift(small_atlas[0], alone.as_points(), options=options, locator=small_atlas[1]).field.displacement
+    atlas, locator = small_atlas
+    alone = _without_correlation(dense[0])
+    by_covariance, by_sigma = (
+        estimate_shift(atlas, alone.as_points(), options=ALL_POINTS, covariance=covariance, locator=locator).field.displacement
+        for covariance in (alone.covariance(0.0), None)
+    )
     np.testing.assert_allclose(by_covariance, by_sigma, atol=1e-6)
 
 
 def test_the_correlated_fit_finds_a_truth_of_the_atlas(small_atlas, dense):
+    atlas, locator = small_atlas
     field, truth = dense
-    found = solve_correlated(*small_atlas, field, 0.2e-3)
-    assert np.linalg.norm(found - truth, axis=1).mean() < 0.1 * np.linalg.norm(truth, axis=1).mean()
+    covariance = field.covariance(0.2e-3)
+    found = estimate_shift(atlas, field.as_points(), options=ALL_POINTS, covariance=covariance, locator=locator)
+    assert np.linalg.norm(found.field.displacement - truth, axis=1).mean() < 0.1 * np.linalg.norm(truth, axis=1).mean()
 
 
 def _without_correlation(field: DenseField) -> DenseField:

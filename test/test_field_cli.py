@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import jsonschema
+import nibabel as nib
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
@@ -20,11 +22,13 @@ from brainshift_ros.correspondence.homologous import HomologousPoints
 from brainshift_ros.errors import InputError
 from brainshift_ros.field.deformation import Deformation
 from brainshift_ros.field.field_file import read_field, write_field
+from brainshift_ros.field.surfaces import read_surface
 from brainshift_ros.image.grid import Grid
 from brainshift_ros.image.io import read_volume, write_volume
 from brainshift_ros.image.volume import Volume
 from brainshift_ros.inverse.points_csv import write_homologous_points
 from brainshift_ros.inverse.shift_estimate import json_schema
+from brainshift_ros.mesh.nearest import boundary_faces
 
 MESH = ellipsoid_mesh(8)
 ATLAS = sagging_atlas(MESH, entries=12)
@@ -94,9 +98,45 @@ def test_warp_keeps_labels(case, tmp_path):
     folder, _ = case
     labels = Volume((read_volume(folder / "t1.nii.gz").data > 100).astype(np.uint8) * 3, GRID.T_patient_voxel)
     write_volume(tmp_path / "l.nii.gz", labels)
-    status, output = run(warp, folder / "field.h5", tmp_path / "l.nii.gz", "-o", tmp_path / "w.nii.gz", "--labels")
+    coarse = Volume(labels.data[::2, ::2, ::2], GRID.T_patient_voxel @ np.diag([2.0, 2.0, 2.0, 1.0]))
+    write_volume(tmp_path / "coarse.nii.gz", coarse)
+    arguments = ("--labels", tmp_path / "l.nii.gz", tmp_path / "one.nii.gz", "--labels", tmp_path / "coarse.nii.gz")
+    status, output = run(
+        warp, folder / "field.h5", folder / "t1.nii.gz", "-o", tmp_path / "w.nii.gz", *arguments, tmp_path / "two.nii.gz"
+    )
     assert status == 0, output
-    assert set(np.unique(read_volume(tmp_path / "w.nii.gz").data)) == {0, 3}
+    one, two = read_volume(tmp_path / "one.nii.gz"), read_volume(tmp_path / "two.nii.gz")
+    assert set(np.unique(one.data)) == set(np.unique(two.data)) == {0, 3}
+    assert two.shape == coarse.shape
+    status, output = run(warp, folder / "field.h5", tmp_path / "l.nii.gz", "-o", tmp_path / "w.nii.gz", "--image-is-labels")
+    assert status == 0, output
+    np.testing.assert_array_equal(read_volume(tmp_path / "w.nii.gz").data, one.data)
+
+
+def test_warp_writes_std_surfaces_and_checks(case, tmp_path):
+    folder, _ = case
+    faces, _ = boundary_faces(MESH.elements)
+    field = replace(smooth_field(replace(MESH, facets={"skull": faces.astype(np.int32)})), provenance={"resected_share": 0.8})
+    write_field(tmp_path / "f.h5", field)
+    status, output = run(
+        warp, tmp_path / "f.h5", folder / "t1.nii.gz", "-o", tmp_path / "w.nii.gz", "--std", tmp_path / "s.nii.gz",
+        "--surface", "brain", tmp_path / "b.ply", "--json", tmp_path / "c.json", "--gap", "0",
+    )  # fmt: skip
+    assert status == 0, output
+    assert "forward after inverse, brain: mean 0.000, 95 % below 0.000, largest 0.000 mm" in output
+    assert "note: the estimate says that the tumour was resected" in output
+    checks = json.loads((tmp_path / "c.json").read_text())
+    assert checks["folded_elements"] == 0
+    assert checks["inverse_error"]["brain"]["max_mm"] < 1e-3
+    assert len(checks["warnings"]) == 1
+    std_mm = np.asarray(nib.load(tmp_path / "s.nii.gz").dataobj)
+    assert np.nanmax(std_mm) == pytest.approx(1e3 * field.std.max(), rel=0.1)
+    status, output = run(
+        warp, folder / "field.h5", folder / "t1.nii.gz", "-o", tmp_path / "w.nii.gz",
+        "--surface", tmp_path / "b.ply", tmp_path / "moved.vtu",
+    )  # fmt: skip
+    assert status == 0, output
+    assert read_surface(tmp_path / "moved.vtu").faces.shape == faces.shape
 
 
 def test_sample_gives_displacement_and_std_in_mm(case, tmp_path):
@@ -125,6 +165,11 @@ def test_sample_gives_displacement_and_std_in_mm(case, tmp_path):
         (solve, ("atlas.h5", "t1.nii.gz", "-o", "out.h5"), "t1.nii.gz: is not a text file"),
         (warp, ("atlas.h5", "t1.nii.gz", "-o", "out.nii.gz"), "is not a brainshift field file"),
         (warp, ("field.h5", "points.csv", "-o", "out.nii.gz"), "is not a NIfTI image"),
+        (warp, ("field.h5", "t1.nii.gz", "-o", "out.nii.gz", "--surface", "brain", "out.xyz"), "does not end in .vtu or"),
+        (warp, ("field.h5", "t1.nii.gz", "-o", "out.nii.gz", "--surface", "falx", "out.vtu"), "not in the field's mesh"),
+        (warp, ("field.h5", "t1.nii.gz", "-o", "out.nii.gz", "--surface", "none.vtu", "out.vtu"), "none.vtu: no such file"),
+        (warp, ("field.h5", "t1.nii.gz", "-o", "out.nii.gz", "--labels", "none.nii", "out.nii"), "none.nii: no such file"),
+        (warp, ("field.h5", "t1.nii.gz", "-o", "out.nii.gz", "--cavity", "0"), "has no tumour"),
         (sample, ("field.h5", "none.csv", "-o", "out.csv"), "none.csv: no such file"),
     ],
 )

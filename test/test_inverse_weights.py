@@ -45,12 +45,12 @@ def problems(draw):
     return WeightProblem(A, b, groups)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(problems())
 def test_the_active_set_is_exact(problem):
     solution = solve_weights(problem)
     assert solution.converged
-    assert solution.kkt_residual < 1e-10
+    assert solution.kkt_residual < 1e-12
     assert (solution.weights >= 0.0).all()
     assert (group_sums(solution.weights, problem.groups) <= problem.limits * (1 + 1e-12)).all()
 
@@ -103,7 +103,7 @@ def test_many_rows_are_condensed_without_loss():
     A[:, 7] = A[:, 3]
     problem = WeightProblem(A, A @ np.full(40, 0.02) + 0.1 * rng.normal(size=900), (WeightGroup("gravity", tuple(range(40))),))
     solution = solve_weights(problem)
-    assert solution.kkt_residual < 1e-10
+    assert solution.kkt_residual < 1e-14
     assert solution.residual_norm == pytest.approx(solve_weights(problem, "nnls").residual_norm, rel=1e-9)
 
 
@@ -142,7 +142,7 @@ def test_one_column():
     np.testing.assert_allclose(solution.weights, [0.5])
 
 
-@pytest.mark.parametrize("wrong", [[0.76, 0.25], [0.74, 0.25], [0.75, 0.30], [1.0, 0.0], [0.0, 0.0], [1.1, -0.1]])
+@pytest.mark.parametrize("wrong", [[0.76, 0.25], [0.74, 0.25], [0.75, 0.30], [0.7, 0.2], [1.0, 0.0], [0.0, 0.0], [1.1, -0.1]])
 def test_the_kkt_residual_sees_wrong_answers(wrong):
     problem = WeightProblem(np.eye(2), np.array([1.0, 0.5]), (WeightGroup("gravity", (0, 1)),))
     assert kkt_residual(problem, np.array([0.75, 0.25])) < 1e-15

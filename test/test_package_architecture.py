@@ -172,7 +172,7 @@ MAY_IMPORT = {
     "correspondence": {"registration", "vessels"},
     "session": {"surface", "atlas", "registration", "vessels", "correspondence", "wire"},
     "field": {"image", "surface", "mesh"},
-    "inverse": {"mesh", "atlas", "correspondence", "field"},
+    "inverse": {"solvers", "mesh", "atlas", "correspondence", "field"},
     "evaluation": {"image", "surface", "septa"},
 }
 

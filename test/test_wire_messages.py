@@ -29,7 +29,7 @@ from brainshift_ros.wire.retraction import (
     encode_columns,
     encode_retraction_vector,
 )
-from brainshift_ros.wire.texts import AtlasInfo, ShiftEstimateText, decode_text, encode_text
+from brainshift_ros.wire.texts import AtlasInfo, ShiftEstimateText, TextStamp, decode_text, encode_text
 from brainshift_ros.wire.vectors import (
     decode_field,
     decode_homologous,
@@ -199,18 +199,22 @@ def test_columns_travel_with_their_layout():
     columns = np.random.default_rng(0).normal(0.0, 0.01, (2, 5, 3)).astype(np.float32)
     plain = encode_columns(columns)
     assert [dimension["stride"] for dimension in plain["layout"]["dim"]] == [30, 15, 3]
-    np.testing.assert_array_equal(decode_columns(travelled(graph.ATLAS_RETRACTION, plain)), columns)
-    none = encode_columns(np.zeros((0, 5, 3), dtype=np.float32))
-    assert decode_columns(travelled(graph.ATLAS_RETRACTION, none)).shape == (0, 5, 3)
+    found = decode_columns(travelled(graph.ATLAS_RETRACTION, plain))
+    np.testing.assert_array_equal(found.columns, columns)
+    assert found.patient_id == ""
+    none = encode_columns(np.zeros((0, 5, 3), dtype=np.float32), patient_id="b0" * 32)
+    assert [dimension["label"] for dimension in none["layout"]["dim"]] == ["columns", f"nodes of {'b0' * 32}", "xyz"]
+    found = decode_columns(travelled(graph.ATLAS_RETRACTION, none))
+    assert (found.columns.shape, found.patient_id) == ((0, 5, 3), "b0" * 32)
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(0, 2**32 - 1), max_size=4), st.integers(0, 2**32 - 1), st.lists(st.floats(width=32), max_size=20))
 def test_columns_with_any_layout_raise_nothing_but_input_errors(sizes, offset, numbers):
-    layout = SimpleNamespace(dim=[SimpleNamespace(size=size, stride=0) for size in sizes], data_offset=offset)
+    layout = SimpleNamespace(dim=[SimpleNamespace(size=size, stride=0, label="nodes") for size in sizes], data_offset=offset)
     with contextlib.suppress(InputError):
         columns = decode_columns(SimpleNamespace(layout=layout, data=np.array(numbers, dtype=np.float32)))
-        assert columns.shape == tuple(sizes)
+        assert columns.columns.shape == tuple(sizes)
 
 
 INFO = {"schema": "brainshift/atlas-info/1", "path": "/a.h5", "atlas_id": "aa", "patient_id": "bb", "nodes": 12}
@@ -238,10 +242,32 @@ def test_faults_of_a_text(text, fault):
     assert fault in str(caught.value)
 
 
+ESTIMATE = {
+    "schema": "brainshift/shift-estimate/2",
+    "valid": False,
+    "reasons": ["the atlas cannot be read"],
+    "ids": {"atlas": "aa"},
+    "stamp": {"sec": 3, "nanosec": 5},
+    "ages_s": {"points": 0.2},
+    "displacement_field": {"stamp": {"sec": 1, "nanosec": 0}, "points": "pp", "atlas": "aa", "current": False},
+}
+
+
+def test_an_estimate_that_gave_nothing_travels_and_names_the_field_that_is_latched():
+    message = travelled(graph.SHIFT_ESTIMATE, encode_text(ShiftEstimateText.model_validate(ESTIMATE)))
+    assert json.loads(message.data) == ESTIMATE
+    assert TextStamp.of(3_000_000_005) == ShiftEstimateText.model_validate(ESTIMATE).stamp
+
+
+@pytest.mark.parametrize("missing", ["stamp", "ages_s", "displacement_field"])
+def test_an_estimate_is_never_sent_without(missing):
+    with pytest.raises(ValueError, match=f"{missing}\n *Field required"):
+        ShiftEstimateText.model_validate({key: value for key, value in ESTIMATE.items() if key != missing})
+
+
 def test_ages_that_are_not_finite_are_never_sent():
-    estimate = {"schema": "brainshift/shift-estimate/1", "valid": True, "reasons": [], "ids": {}, "ages_s": {"points": np.nan}}
     with pytest.raises(ValueError, match="finite"):
-        ShiftEstimateText.model_validate(estimate)
+        ShiftEstimateText.model_validate(ESTIMATE | {"ages_s": {"points": np.nan}})
 
 
 def test_arrows_run_from_where_tissue_was_to_where_it_is_and_the_scale_is_in_mm():
@@ -259,6 +285,18 @@ def test_arrows_run_from_where_tissue_was_to_where_it_is_and_the_scale_is_in_mm(
     assert (scale[0], scale[-1]) == ("0.0 mm", "4.0 mm")
     for arrow, fraction in ((arrows[0], 0.25), (arrows[1], 1.0), (arrows[2], 0.5), (arrows[3], 0.0)):
         assert (arrow.color.r, arrow.color.g, arrow.color.b) == pytest.approx(colormaps["viridis"](fraction)[:3], abs=0.01)
+    assert len({(marker.ns, marker.id) for marker in markers}) == len(markers)
+
+
+def test_arrows_of_an_outdated_field_are_grey_and_say_so():
+    mesh = tetrahedron()
+    plain = displacement_markers(mesh.nodes, mesh.facets["skull"], 0.01 * mesh.nodes, 10, 0, current=False)
+    markers = travelled(graph.DISPLACEMENT_MARKERS, plain).markers
+    for marker in markers:
+        if marker.ns in ("displacement", "scale"):
+            assert marker.color.r == marker.color.g == marker.color.b
+            assert marker.color.a < 0.5
+    assert [marker.text for marker in markers if marker.ns == "notice"] == ["not of the newest measurement"]
     assert len({(marker.ns, marker.id) for marker in markers}) == len(markers)
 
 

@@ -203,7 +203,7 @@ def _content(
         tissue=patient.tissue,
         scene=scene,
         entries=entries,
-        groups=groups_of(entries),
+        groups=groups_of(entries, scene.weight_sums),
         materials=materials,
         diagnostics=np.concatenate([part.diagnostics for part in parts]),
         solver=", ".join(sorted({part.solver for part in parts})),

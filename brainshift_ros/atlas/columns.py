@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainshift_ros.atlas.entry import AtlasEntry, WeightGroup
+from brainshift_ros.atlas.entry import PREOPERATIVE, RETRACTION, AtlasEntry, WeightGroup
 from brainshift_ros.atlas.orientations import directions_in_cone
-from brainshift_ros.atlas.scene import Scene, orientations_of
+from brainshift_ros.atlas.scene import Scene, WeightSums, orientations_of
 from brainshift_ros.errors import InputError
 
 #: Range of fluid levels, as fractions of the head's extent along up; the thesis designates its levels by hand. On the MNI152
@@ -92,6 +92,20 @@ def entries_of(scene: Scene, source: object = "scene") -> tuple[AtlasEntry, ...]
     )
 
 
-def groups_of(entries: tuple[AtlasEntry, ...]) -> tuple[WeightGroup, ...]:
-    """Weight groups of (3.9): the weights of all solutions computed before surgery share one sum limit."""
-    return (WeightGroup("preoperative", tuple(range(len(entries)))),)
+def groups_of(entries: tuple[AtlasEntry, ...], sums: WeightSums | None = None) -> tuple[WeightGroup, ...]:
+    """Weight groups of (3.9) and (6.3): all solutions computed before surgery share one sum, those of a blade another.
+
+    The second group has no columns before a blade is used; it holds the limit of those that are appended then.
+
+    Parameters
+    ----------
+    entries
+        Of the atlas.
+    sums
+        The limits; all 1 if None.
+    """
+    sums = sums or WeightSums()
+    return (
+        WeightGroup(PREOPERATIVE, tuple(range(len(entries))), sums.preoperative),
+        WeightGroup(RETRACTION, (), sums.retraction),
+    )

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+#: Names of the groups: columns that were solved before surgery, and those that a blade appends during it.
+PREOPERATIVE, RETRACTION = "preoperative", "retraction"
+
 
 @dataclass(frozen=True)
 class AtlasEntry:
@@ -37,7 +40,7 @@ class AtlasEntry:
 
 @dataclass(frozen=True)
 class WeightGroup:
-    """Columns whose weights sum to at most `sum_limit`: (3.9) for one group, (6.3) for two."""
+    """Columns whose weights sum to at most `sum_limit`: (3.9) for one group, (6.3) for two. It may have no columns yet."""
 
     name: str
     columns: tuple[int, ...]

@@ -62,6 +62,13 @@ class Craniotomy(_Part):
     diameter_mm: float = Field(gt=5.0, le=200.0)
 
 
+class WeightSums(_Part):
+    """Largest sum of the weights of entries that share it: 1 interpolates between them (3.9), (6.3); more extrapolates."""
+
+    preoperative: Annotated[float, Field(gt=0.0, le=10.0, description="of all entries that are solved before surgery")] = 1.0
+    retraction: Annotated[float, Field(gt=0.0, le=10.0, description="of the columns that a blade appends in surgery")] = 1.0
+
+
 class Transient(_Part):
     """Time stepping of the consolidation model."""
 
@@ -92,6 +99,7 @@ class Scene(_Part):
     septa: bool = True
     craniotomy: Craniotomy | None = None
     model: Model = Model()
+    weight_sums: WeightSums = WeightSums()
     tolerance_mm: Annotated[float, Field(gt=0.0, le=50.0)] | None = None
 
 

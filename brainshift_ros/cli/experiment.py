@@ -27,7 +27,15 @@ EXPERIMENTS: dict[str, tuple[str, str]] = {
     "scan-texture": ("brainshift_ros.experiments.scan_texture", "Would texture hold a scan better than its shape does? (I2)"),
     "vessels": ("brainshift_ros.experiments.vessels", "Which vessels are found, by which filter, at what cost? (E7)"),
     "dense-field": ("brainshift_ros.experiments.dense_field", "Is a dense field worth more than its points? (E6)"),
+    "inverse-methods": ("brainshift_ros.experiments.inverse_methods", "Which inverse method holds far from its points? (I5)"),
     "scan-resolution": ("brainshift_ros.experiments.scan_resolution", "What do finer scans bring, and cost in time? (E7)"),
+    "solvers": ("brainshift_ros.experiments.solvers", "Which solver finds the weights exactly, in what time? (E7)"),
+    "atlas-extent": ("brainshift_ros.experiments.atlas_extent", "How far may the head lie from where it was planned? (E3)"),
+    "atlas-size": ("brainshift_ros.experiments.atlas_size", "How many head orientations does an atlas need? (E3)"),
+    "atlas-levels": ("brainshift_ros.experiments.atlas_levels", "Does an atlas need levels of fluid and drug? (E3)"),
+    "atlas-content": ("brainshift_ros.experiments.atlas_content", "What does an atlas hold, and an estimate use of it? (E3)"),
+    "uncertainty": ("brainshift_ros.experiments.uncertainty", "Does the stated standard deviation hold up? (I5)"),
+    "outliers": ("brainshift_ros.experiments.outliers", "How many wrong points does an estimate bear? (E6, E8)"),
 }
 
 

@@ -11,7 +11,6 @@ from brainshift_ros.field.deformation import Deformation
 from brainshift_ros.field.field_file import read_field
 from brainshift_ros.files import writable_target
 from brainshift_ros.inverse.points_csv import DISPLACEMENT_COLUMNS, POINT_COLUMNS, read_points, write_table
-from brainshift_ros.mesh.locate import PointLocator
 from brainshift_ros.units import m_to_mm, mm_to_m
 
 #: Points this near to the surface belong to the brain: cortex points carry the noise of a scan, and of rounding.
@@ -31,9 +30,9 @@ def command(field: Path, points: Path, output: Path) -> None:
     writable_target(output)
     shift = read_field(field)
     positions = read_points(points)
-    locator = PointLocator(shift.mesh)
-    located = locator.locate(positions, max_outside_m=float(mm_to_m(ON_SURFACE_MM)))
-    displacement = Deformation(shift).forward_at(positions, locator)
+    deformation = Deformation(shift)
+    located = deformation.locator.locate(positions, max_outside_m=float(mm_to_m(ON_SURFACE_MM)))
+    displacement = deformation.forward_at(positions)
     displacement[located.found] = located.interpolate(shift.mesh, shift.displacement)[located.found]
     std = located.interpolate(shift.mesh, shift.std)
     numbers = np.column_stack([m_to_mm(positions), m_to_mm(displacement), m_to_mm(std)]).tolist()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from brainshift_ros.demo.preparation import Progress
 from brainshift_ros.demo.recording import RecordedCase
 from brainshift_ros.demo.session import Session
 from brainshift_ros.demo.settings import DemoFiles
+from brainshift_ros.field.checks import check_map
 from brainshift_ros.field.deformation import Deformation
 from brainshift_ros.field.displacement import DisplacementField
 from brainshift_ros.field.warp import warp_image
@@ -28,7 +30,6 @@ from brainshift_ros.pictures.patient_page import patient_page
 from brainshift_ros.pictures.scan import scan_page
 from brainshift_ros.registration.scan import OrganisedScan
 from brainshift_ros.session.session import LrsSession
-from brainshift_ros.units import m_to_mm
 
 
 def draw_all(
@@ -40,14 +41,8 @@ def draw_all(
     session: Session,
     field: DisplacementField,
     progress: Progress,
-) -> dict[str, float]:
-    """Write the updated MR, both displacement images and the pictures.
-
-    Returns
-    -------
-    dict
-        Checks of the map: error of its inverse in mm, folded elements, smallest Jacobian determinant.
-    """
+) -> dict[str, Any]:
+    """Write the updated MR, both displacement images and the pictures; return the checks of the map, as JSON."""
     deformation, grid = Deformation(field), Grid.of(t1)
     progress("updated MR", 0.1)
     warped = warp_image(deformation, t1)
@@ -67,13 +62,7 @@ def draw_all(
     _draw_scans(files, patient, case, session)
     progress("vectors", 0.9)
     _draw_vectors(files, patient, session, field)
-    jacobian, error = deformation.jacobian, deformation.inversion_error
-    return {
-        "inverse_error_mm_mean": float(m_to_mm(error.mean)),
-        "inverse_error_mm_95": float(m_to_mm(error.p95)),
-        "folded_elements": jacobian.folded_elements,
-        "jacobian_min": jacobian.smallest_in_brain,
-    }
+    return check_map(deformation, warped.inverse, grid, deformation.owner_now(grid)).to_json()
 
 
 def _draw_boundary(files: DemoFiles, case: RecordedCase) -> None:

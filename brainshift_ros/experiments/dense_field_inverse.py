@@ -7,25 +7,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from brainshift_ros.atlas.orientations import directions_in_cone
-from brainshift_ros.correspondence.dense import DenseField, interpolate
+from brainshift_ros.correspondence.dense import interpolate
 from brainshift_ros.correspondence.homologous import HomologousPoints
-from brainshift_ros.experiments.patients import craniotomy_opening, study_groups, template_patient
+from brainshift_ros.experiments.inverse_cases import Targets, measure_facets, opening_facets
+from brainshift_ros.experiments.inverse_truths import InverseTruth, TruthSpec, solve_truth
+from brainshift_ros.experiments.patients import template_patient
 from brainshift_ros.experiments.skull_cases import SKULLS, MemoryAtlas, build_memory_atlas
-from brainshift_ros.inverse.appended import AppendedAtlas
 from brainshift_ros.inverse.estimate import estimate_shift
-from brainshift_ros.inverse.methods import solve_weights
-from brainshift_ros.inverse.problem import WeightProblem
-from brainshift_ros.inverse.rows import rows_at_points
+from brainshift_ros.inverse.span import AtlasSpan, atlas_span
 from brainshift_ros.mechanics.materials import material_of
 from brainshift_ros.mechanics.system import assemble_system
 from brainshift_ros.mesh.locate import PointLocator
 from brainshift_ros.mesh.tetmesh import TetMesh
 from brainshift_ros.registration.thinning import voxel_means
-from brainshift_ros.simulation.truth import Truth, direction_between, simulate_truth
+from brainshift_ros.simulation.truth import direction_between
 from brainshift_ros.units import m_to_mm, mm_to_m
 
 Row = dict[str, Any]
@@ -75,57 +73,36 @@ def estimates(folder: Path, full: bool, seeds: range, progress: Progress) -> lis
     progress("atlas", 0.0)
     atlas, _ = build_memory_atlas({False: system}, _PLANNED, _CONE, _ORIENTATIONS, _LEVELS, _SKULL)
     progress("atlas", 1.0)
-    locator = PointLocator(atlas.mesh)
+    locator, span = PointLocator(atlas.mesh), atlas_span(atlas)
     planned = directions_in_cone(_PLANNED, _CONE, _ORIENTATIONS)
     rows: list[Row] = []
     for number, seed in enumerate(seeds):
         progress("truths and estimates", number / len(seeds))
         rng = np.random.default_rng([seed, 56])
         # Every truth pulls where the atlas has no entry, between those of a cone that is turned for each.
-        direction = direction_between(planned[rng.permutation(len(planned))[:12]], _PLANNED, _CONE)
-        truth = simulate_truth(
-            truth_patient,
-            direction,
-            float(rng.uniform(0.38, 0.62)),
-            seed=seed,
-            skull=_SKULL.model,
-            opening=craniotomy_opening(truth_patient.mesh),
-        )
-        targets = _Targets(truth, atlas, locator)
+        x, y, z = direction_between(planned[rng.permutation(len(planned))[:12]], _PLANNED, _CONE)
+        spec = TruthSpec(seed, (float(x), float(y), float(z)), float(rng.uniform(0.38, 0.62)), skull=_SKULL.model)
+        truth = solve_truth(truth_patient, spec)
+        targets = Targets(truth, atlas, locator)
+        surface = targets.groups["surface"]
         for coverage, share in COVERAGES.items():
             measured, measured_side = _measured(truth, share, rng)
-            for method, field, told in _estimates(atlas, locator, measured):
+            near = measured_side(truth.mesh.nodes[surface])
+            sides = {"surface, measured side": surface[near], "surface, other side": surface[~near]}
+            for method, field, told in _estimates(atlas, locator, span, measured):
                 labels = {"seed": seed, "coverage": coverage, "method": method}
-                rows += [labels | row | told for row in targets.errors(field, measured_side)]
+                rows += [labels | row | told for row in targets.errors(field, sides)]
     progress("truths and estimates", 1.0)
     return rows
 
 
-def solve_correlated(atlas: MemoryAtlas, locator: PointLocator, dense: DenseField, model_sigma_m: float) -> NDArray[np.float64]:
-    """Fit with the full W = Cov^-1 of (8.5): rows and displacements are whitened by the covariance's Cholesky factor.
-
-    Returns
-    -------
-    displacement
-        Shape (N, 3), metres, at the atlas's nodes.
-    """
-    rows = rows_at_points(AppendedAtlas(atlas, None), dense.as_points(), locator=locator)
-    factor = np.linalg.cholesky(dense.covariance(model_sigma_m)[np.ix_(rows.kept, rows.kept)])
-    columns = rows.M.shape[2]
-    A = scipy.linalg.solve_triangular(factor, rows.M.reshape(len(rows.kept), -1), lower=True).reshape(-1, columns)
-    b = scipy.linalg.solve_triangular(factor, dense.displacements[rows.kept], lower=True).reshape(-1)
-    weights = solve_weights(WeightProblem(A, b, atlas.groups)).weights
-    active = np.flatnonzero(weights)
-    return np.asarray(atlas.columns(active) @ weights[active], dtype=np.float64)
-
-
 def _estimates(
-    atlas: MemoryAtlas, locator: PointLocator, measured: HomologousPoints
+    atlas: MemoryAtlas, locator: PointLocator, span: AtlasSpan, measured: HomologousPoints
 ) -> Iterator[tuple[str, NDArray[np.float64], Row]]:
     """Each method's displacement at the atlas's nodes, and what the dense field said of itself."""
 
-    def solved(points: HomologousPoints) -> NDArray[np.float64]:
-        return estimate_shift(atlas, points, locator=locator).field.displacement
+    def solved(points: HomologousPoints, covariance: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        return estimate_shift(atlas, points, covariance=covariance, locator=locator, span=span).field.displacement
 
     dense = interpolate(measured, _cortex_points(atlas.mesh))
     told = {
@@ -138,65 +115,26 @@ def _estimates(
     yield UNWEIGHTED, solved(HomologousPoints(dense.points, dense.displacements, alike)), told
     yield DIAGONAL, solved(dense.as_points()), told
     yield THINNED, solved(dense.as_independent_points()), told
-    yield COVARIANCE, solve_correlated(atlas, locator, dense, MODEL_SIGMA_M), told
-
-
-def _opening_facets(mesh: TetMesh) -> NDArray[np.int32]:
-    skull = mesh.facets["skull"]
-    return np.asarray(skull[craniotomy_opening(mesh)[skull].all(axis=1)])
+    yield COVARIANCE, solved(dense.as_points(), dense.covariance(MODEL_SIGMA_M)), told
 
 
 def _cortex_points(mesh: TetMesh) -> NDArray[np.float64]:
     """Points of the cortex in the opening, about `SPACING_M` apart, from its facets cut into 16."""
-    corners = mesh.nodes[_opening_facets(mesh)]
+    corners = mesh.nodes[opening_facets(mesh)]
     steps = (np.arange(4) + 1 / 3) / 4.0
     shares = np.array([(a, b, 1.0 - a - b) for a in steps for b in steps if a + b < 1.0])
     return voxel_means(np.einsum("ka,nai->nki", shares, corners).reshape(-1, 3), SPACING_M)[0]
 
 
-def _measured(truth: Truth, share: float, rng: np.random.Generator) -> tuple[HomologousPoints, Side]:
+def _measured(truth: InverseTruth, share: float, rng: np.random.Generator) -> tuple[HomologousPoints, Side]:
     """Noisy points of the truth's cortex within the lowest `share` along a random direction, and a test for that side."""
-    mesh = truth.mesh
-    facets = _opening_facets(mesh)
-    corners = mesh.nodes[facets]
+    facets = opening_facets(truth.mesh)
+    corners = truth.mesh.nodes[facets]
     middle, centers = corners.reshape(-1, 3).mean(axis=0), corners.mean(axis=1)
     _, _, axes = np.linalg.svd(centers - centers.mean(axis=0), full_matrices=False)
     angle = rng.uniform(0.0, 2 * np.pi)
     direction = np.array([np.cos(angle), np.sin(angle)]) @ axes[:2]
-    limit = np.quantile((centers - middle) @ direction, share)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    area = area * ((centers - middle) @ direction <= limit)
-    chosen = facets[rng.choice(len(facets), POINTS, p=area / area.sum())]
-    barycentric = rng.dirichlet(np.ones(3), POINTS)
-    points, moved = (np.einsum("na,nai->ni", barycentric, v[chosen]) for v in (mesh.nodes, truth.solution.displacement))
-    noisy = moved + rng.normal(0.0, NOISE_M, moved.shape)
-    return HomologousPoints(points, noisy, np.full(POINTS, NOISE_M)), lambda at: (at - middle) @ direction <= limit
-
-
-class _Targets:
-    """Nodes of a truth by group, found once in the atlas's mesh."""
-
-    def __init__(self, truth: Truth, atlas: MemoryAtlas, locator: PointLocator) -> None:
-        self._atlas = atlas
-        located = locator.locate(truth.mesh.nodes, _BESIDE_M)
-        self._located = located
-        self._nodes, self._true = truth.mesh.nodes, truth.solution.displacement
-        self._groups = {name: ids[located.found[ids]] for name, ids in study_groups(truth.mesh).items()}
-
-    def errors(self, field: NDArray[np.float64], measured_side: Side) -> Iterator[Row]:
-        """Error of a field at the atlas's nodes, by group; the surface also by the side on which points were measured."""
-        error = m_to_mm(np.linalg.norm(self._located.interpolate(self._atlas.mesh, field) - self._true, axis=1))
-        shift = m_to_mm(np.linalg.norm(self._true, axis=1))
-        surface = self._groups["surface"]
-        near = measured_side(self._nodes[surface])
-        sides = {"surface, measured side": surface[near], "surface, other side": surface[~near]}
-        for name, ids in {**self._groups, **sides}.items():
-            if len(ids):
-                yield {
-                    "group": name,
-                    "targets": len(ids),
-                    "shift_mm": float(shift[ids].mean()),
-                    "error_mm": float(error[ids].mean()),
-                    "error_mm_p95": float(np.quantile(error[ids], 0.95)),
-                    "correction_percent": float(100.0 * (1.0 - error[ids].mean() / shift[ids].mean())),
-                }
+    along = (centers - middle) @ direction
+    limit = np.quantile(along, share)
+    measured = measure_facets(truth, facets[along <= limit], POINTS, NOISE_M, rng)
+    return measured, lambda at: (at - middle) @ direction <= limit

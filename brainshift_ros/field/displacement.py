@@ -25,7 +25,8 @@ class DisplacementField:
     std
         Shape (N,), standard deviation of a displacement component, metres.
     provenance
-        JSON-able facts: ``patient_id``, ``atlas_id``, weights, validity, software version.
+        JSON-able facts: ``patient_id``, ``atlas_id``, weights, validity, software version; ``resected_share``, which part
+        of the weights belongs to columns without the tumour.
     """
 
     mesh: TetMesh

@@ -1,24 +1,28 @@
-"""Draw a tetrahedral mesh into a voxel grid: which element holds each voxel centre, and nodal values there."""
+"""Draw a tetrahedral mesh into a voxel grid: which element holds each voxel centre, and nodal values there.
+
+Each element is cut by the voxel lines along the last index axis; the four face planes bound an interval on each line, so
+only voxels that lie inside are ever touched.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainshift_ros.image.grid import Grid
+from brainshift_ros.parallel import threaded
 
 #: Voxel centres this far outside an element, in barycentric coordinates, still count: faces leave no gaps.
 _TOLERANCE = 1e-7
 
-_ELEMENTS_AT_ONCE = 8_000
-_VOXELS_AT_ONCE = 200_000
+_ELEMENTS_AT_ONCE = 4_000
 
 
 def rasterise(nodes: NDArray[np.float64], elements: NDArray, grid: Grid) -> NDArray[np.int32]:
     """Element that holds each voxel centre.
-
-    Each element is cut by the voxel lines along the last index axis; the four face planes bound an interval on each
-    line, so only voxels that lie inside are ever touched.
 
     Parameters
     ----------
@@ -33,43 +37,99 @@ def rasterise(nodes: NDArray[np.float64], elements: NDArray, grid: Grid) -> NDAr
     -------
     Shape of the grid, -1 outside the mesh. On shared faces the higher element index wins.
     """
-    voxels = grid.to_voxels(nodes)
     owner = np.full(int(np.prod(grid.shape)), -1, dtype=np.int32)
-    for first in range(0, len(elements), _ELEMENTS_AT_ONCE):
-        part = elements[first : first + _ELEMENTS_AT_ONCE]
-        element, flat = _voxels_inside(voxels[part], grid.shape)
-        owner[flat] = first + element
+    voxels = grid.to_voxels(nodes)
+
+    def piece(first: int) -> tuple[NDArray, NDArray]:
+        corners = voxels[elements[first : first + _ELEMENTS_AT_ONCE]]
+        runs = _runs_inside(corners, *_barycentric_maps(corners), grid.shape)
+        voxel, _ = runs.voxels()
+        return voxel, np.repeat(first + runs.element, runs.length)
+
+    for voxel, element in _in_order(piece, len(elements)):
+        owner[voxel] = element
     return owner.reshape(grid.shape)
 
 
-def interpolate(
-    nodes: NDArray[np.float64], elements: NDArray, nodal: NDArray, grid: Grid, owner: NDArray[np.int32]
-) -> NDArray[np.float32]:
-    """Nodal values at the voxel centres inside the mesh, by linear interpolation.
+def draw(nodes: NDArray[np.float64], elements: NDArray, nodal: NDArray, grid: Grid, into: NDArray[np.float32]) -> None:
+    """Overwrite the voxels inside the mesh with nodal values, interpolated linearly at their centres.
 
     Parameters
     ----------
     nodes, elements, grid
-        As given to :func:`rasterise`.
+        As given to :func:`rasterise`; where that names an element, this interpolates in it.
     nodal
         Shape (N, C).
-    owner
-        The answer of :func:`rasterise`.
-
-    Returns
-    -------
-    Shape (I, J, K, C), zero outside the mesh.
+    into
+        Shape (I, J, K, C), contiguous.
     """
-    constant, slope = _affine_maps(grid.to_voxels(nodes)[elements], nodal[elements])
-    result = np.zeros((owner.size, nodal.shape[1]), dtype=np.float32)
-    flat = owner.reshape(-1)
-    inside = np.flatnonzero(flat >= 0)
-    for first in range(0, inside.size, _VOXELS_AT_ONCE):
-        index = inside[first : first + _VOXELS_AT_ONCE]
-        element = flat[index]
-        voxel = np.stack(np.unravel_index(index, grid.shape), axis=1).astype(np.float64)
-        result[index] = constant[element] + np.einsum("nc,ncd->nd", voxel, slope[element])
-    return result.reshape(*grid.shape, nodal.shape[1])
+    flat = into.reshape(-1, nodal.shape[1])
+    voxels = grid.to_voxels(nodes)
+
+    def piece(first: int) -> tuple[NDArray, NDArray]:
+        part = elements[first : first + _ELEMENTS_AT_ONCE]
+        barycentric = _barycentric_maps(voxels[part])
+        runs = _runs_inside(voxels[part], *barycentric, grid.shape)
+        constant, slope = _affine_maps(*barycentric, nodal[part])
+        ijk = np.stack(np.unravel_index(runs.start, grid.shape), axis=1).astype(np.float64)
+        at_start = constant[runs.element] + np.einsum("na,nac->nc", ijk, slope[runs.element])
+        voxel, offset = runs.voxels()
+        values = np.repeat(slope[runs.element, 2].astype(np.float32), runs.length, axis=0)
+        values *= offset.astype(np.float32)[:, None]
+        values += np.repeat(at_start.astype(np.float32), runs.length, axis=0)
+        return voxel, values
+
+    for voxel, values in _in_order(piece, len(elements)):
+        flat[voxel] = values
+
+
+def _in_order(piece: Callable[[int], tuple[NDArray, NDArray]], count: int) -> Iterator[tuple[NDArray, NDArray]]:
+    return threaded(piece, range(0, count, _ELEMENTS_AT_ONCE))
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """Voxels in a row that one element holds: the element, the flat index of the first, and how many; each shape (r,)."""
+
+    element: NDArray[np.int64]
+    start: NDArray[np.int64]
+    length: NDArray[np.int64]
+
+    def voxels(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Flat index of each voxel, and its position in its run."""
+        offset = _positions(self.length)
+        return np.repeat(self.start, self.length) + offset, offset
+
+
+def _runs_inside(corners: NDArray, constant: NDArray, slope: NDArray, shape: tuple[int, int, int]) -> _Runs:
+    """Find the voxel centres inside elements with corners (m, 4, 3) in voxel units, and their barycentric maps."""
+    limits = np.array(shape) - 1
+    first = np.maximum(np.ceil(corners.min(axis=1) - 1e-6), 0).astype(np.int64)
+    last = np.minimum(np.floor(corners.max(axis=1) + 1e-6), limits).astype(np.int64)
+    count = np.maximum(last - first + 1, 0)
+    usable = (count > 0).all(axis=1) & np.isfinite(slope).all(axis=(1, 2))
+    lines = np.where(usable, count[:, 0] * count[:, 1], 0)
+    element, step = np.repeat(np.arange(len(lines)), lines), _positions(lines)
+    across = np.maximum(count[element, 1], 1)
+    i, j = first[element, 0] + step // across, first[element, 1] + step % across
+    low, high = (np.repeat(end[:, 2].astype(np.float64), lines) for end in (first, last))
+    # A face that a line runs along is crossed far away, on the side that leaves or cuts the line as a whole.
+    along = np.where(slope[..., 2] == 0.0, 1e-30, slope[..., 2])
+    with np.errstate(invalid="ignore", over="ignore"):
+        at_origin, per_i, per_j = -(constant + _TOLERANCE) / along, -slope[..., 0] / along, -slope[..., 1] / along
+    for corner in range(4):  # repeating is several times as fast as taking by index
+        crossing = np.repeat(per_i[:, corner], lines) * i
+        crossing += np.repeat(per_j[:, corner], lines) * j
+        crossing += np.repeat(at_origin[:, corner], lines)
+        enters = np.repeat(along[:, corner] > 0.0, lines)
+        np.maximum(low, crossing, out=low, where=enters)
+        np.minimum(high, crossing, out=high, where=~enters)
+    np.maximum(high, -1.0, out=high)  # faces far away are no integers
+    np.minimum(low, high + 1.0, out=low)
+    k = np.ceil(low).astype(np.int64)
+    length = np.floor(high).astype(np.int64) - k + 1
+    kept = np.flatnonzero(length > 0)
+    return _Runs(element[kept], ((i * shape[1] + j) * shape[2] + k)[kept], length[kept])
 
 
 def _barycentric_maps(corners: NDArray) -> tuple[NDArray, NDArray]:
@@ -86,41 +146,12 @@ def _barycentric_maps(corners: NDArray) -> tuple[NDArray, NDArray]:
     return constant, slope
 
 
-def _affine_maps(corners: NDArray, values: NDArray) -> tuple[NDArray, NDArray]:
-    """Interpolated values as affine functions of position: constants (M, C) and slopes (M, 3, C)."""
-    constant, slope = _barycentric_maps(corners)
+def _affine_maps(constant: NDArray, slope: NDArray, values: NDArray) -> tuple[NDArray, NDArray]:
+    """Values (M, 4, C) at the corners as affine functions of position, by barycentric maps: (M, C) and (M, 3, C)."""
     return np.einsum("na,nac->nc", constant, values), np.einsum("nab,nac->nbc", slope, values)
 
 
-def _voxels_inside(corners: NDArray, shape: tuple[int, int, int]) -> tuple[NDArray, NDArray]:
-    """(element, flat voxel index) pairs of the voxel centres inside elements with corners (m, 4, 3) in voxel units."""
-    limits = np.array(shape) - 1
-    first = np.maximum(np.ceil(corners.min(axis=1) - 1e-6), 0).astype(np.int64)
-    last = np.minimum(np.floor(corners.max(axis=1) + 1e-6), limits).astype(np.int64)
-    count = np.maximum(last - first + 1, 0)
-    constant, slope = _barycentric_maps(corners)
-    usable = (count > 0).all(axis=1) & np.isfinite(slope).all(axis=(1, 2))
-    lines = np.where(usable, count[:, 0] * count[:, 1], 0)
-    element, step = _runs(lines)
-    i = first[element, 0] + step // np.maximum(count[element, 1], 1)
-    j = first[element, 1] + step % np.maximum(count[element, 1], 1)
-    low, high = first[element, 2].astype(np.float64), last[element, 2].astype(np.float64)
-    for corner in range(4):
-        at_zero = constant[element, corner] + slope[element, corner, 0] * i + slope[element, corner, 1] * j + _TOLERANCE
-        along = slope[element, corner, 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            crossing = -at_zero / along
-        low = np.where(along > 0, np.maximum(low, crossing), low)
-        high = np.where(along < 0, np.minimum(high, crossing), high)
-        high = np.where((along == 0) & (at_zero < 0), -1.0, high)
-    start = np.ceil(low).astype(np.int64)
-    length = np.maximum(np.floor(high).astype(np.int64) - start + 1, 0)
-    line, offset = _runs(length)
-    k = start[line] + offset
-    return element[line], (i[line] * shape[1] + j[line]) * shape[2] + k
-
-
-def _runs(length: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Expand runs: owner index and position within the run, for runs of the given lengths."""
-    owner = np.repeat(np.arange(length.size), length)
-    return owner, np.arange(owner.size) - np.repeat(np.cumsum(length) - length, length)
+def _positions(length: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Position within its run of each member of runs of the given lengths."""
+    end = np.cumsum(length)
+    return np.arange(end[-1] if end.size else 0) - np.repeat(end - length, length)

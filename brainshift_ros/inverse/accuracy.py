@@ -20,11 +20,15 @@ def shift_correction_percent(measured: NDArray[np.float64], estimated: NDArray[n
     return (1.0 - float(np.mean(np.linalg.norm(measured - estimated, axis=1))) / shift) * 100.0
 
 
-def angular_error_deg(measured: NDArray[np.float64], estimated: NDArray[np.float64]) -> float | None:
-    """Mean angle between displacements where both are non-zero; None where there are none."""
+def angles_deg(measured: NDArray[np.float64], estimated: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles (k,) between displacements, shape (n, 3) each, where both are non-zero."""
     lengths = np.linalg.norm(measured, axis=1) * np.linalg.norm(estimated, axis=1)
     moving = lengths > 0.0
-    if not moving.any():
-        return None
     cosine = np.sum(measured[moving] * estimated[moving], axis=1) / lengths[moving]
-    return float(np.degrees(np.mean(np.arccos(np.clip(cosine, -1.0, 1.0)))))
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def angular_error_deg(measured: NDArray[np.float64], estimated: NDArray[np.float64]) -> float | None:
+    """Mean angle between displacements where both are non-zero; None where there are none."""
+    angles = angles_deg(measured, estimated)
+    return float(angles.mean()) if angles.size else None

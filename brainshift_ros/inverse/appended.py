@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainshift_ros.atlas.entry import AtlasEntry, WeightGroup
+from brainshift_ros.atlas.entry import RETRACTION, AtlasEntry, WeightGroup
 from brainshift_ros.errors import InputError
 from brainshift_ros.inverse.atlas_like import AtlasLike
-from brainshift_ros.inverse.shift_estimate import RETRACTION, EntryWeight
+from brainshift_ros.inverse.shift_estimate import EntryWeight
 from brainshift_ros.mesh.tetmesh import TetMesh
 
 
 class AppendedAtlas:
-    """An atlas and its appended retraction columns, which are a group of their own with the sum limit 1.
+    """An atlas and its appended retraction columns, which are a group of their own.
+
+    Its sum limit is that of the atlas's group `retraction`; the 1 of (6.3) where the atlas has no such group.
 
     Parameters
     ----------
@@ -53,9 +56,12 @@ class AppendedAtlas:
 
     @property
     def groups(self) -> tuple[WeightGroup, ...]:
-        """Groups of the atlas, and one of the appended columns."""
+        """Groups of the atlas, the appended columns among those of the group `retraction`; groups without columns left out."""
         appended = tuple(range(self._own, self._own + len(self._retraction)))
-        return (*self._atlas.groups, WeightGroup(RETRACTION, appended)) if appended else tuple(self._atlas.groups)
+        groups = {group.name: group for group in (WeightGroup(RETRACTION, ()), *self._atlas.groups)}
+        retraction = groups.pop(RETRACTION)
+        joined = replace(retraction, columns=(*retraction.columns, *appended))
+        return tuple(group for group in (*groups.values(), joined) if group.columns)
 
     def rows(self, node_ids: ArrayLike) -> NDArray[np.float64]:
         """Displacements of a few nodes in all columns, shape (n, 3, m + k), metres."""

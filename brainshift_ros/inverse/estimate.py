@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainshift_ros import __version__
+from brainshift_ros.atlas.entry import RETRACTION
 from brainshift_ros.correspondence.homologous import HomologousPoints
 from brainshift_ros.errors import InputError
 from brainshift_ros.field.displacement import DisplacementField
 from brainshift_ros.h5 import digest
-from brainshift_ros.inverse.accuracy import angular_error_deg, shift_correction_percent
 from brainshift_ros.inverse.appended import AppendedAtlas
 from brainshift_ros.inverse.atlas_like import AtlasLike
+from brainshift_ros.inverse.gathered import gather
+from brainshift_ros.inverse.measurement import check_measurement
+from brainshift_ros.inverse.mechanisms import mechanism_shares
 from brainshift_ros.inverse.options import InverseOptions
-from brainshift_ros.inverse.robust import RobustFit, fit_robustly
+from brainshift_ros.inverse.prior import weight_prior
+from brainshift_ros.inverse.robust import fit_robustly
 from brainshift_ros.inverse.rows import rows_at_points
 from brainshift_ros.inverse.shift_estimate import EntryWeight, ShiftEstimate
-from brainshift_ros.inverse.uncertainty import node_std, reduced_chi_square, weight_covariance
-from brainshift_ros.inverse.verdict import Fit, reasons_against, remarks
+from brainshift_ros.inverse.span import AtlasSpan, atlas_span
+from brainshift_ros.inverse.uncertainty import condition
+from brainshift_ros.inverse.verdict import Fit, far_field, reasons_against, remarks
 from brainshift_ros.mesh.locate import PointLocator
 
 
@@ -30,7 +36,9 @@ def estimate_shift(
     *,
     retraction: NDArray[np.float32] | None = None,
     options: InverseOptions | None = None,
+    covariance: NDArray[np.float64] | None = None,
     locator: PointLocator | None = None,
+    span: AtlasSpan | None = None,
 ) -> ShiftEstimate:
     """Estimate the shift of the whole brain from a sparse measurement: (3.9), with retraction (6.3), weighted (8.3).
 
@@ -44,8 +52,12 @@ def estimate_shift(
         Shape (k, N, 3), metres: columns solved during surgery, a group of their own with the sum limit 1.
     options
         Settings; the defaults if None.
-    locator
-        Locator of ``atlas.mesh``, if one is at hand: building it takes most of a second.
+    covariance
+        Shape (n, n), metres squared: of a displacement component over the measured points, the W^-1 of (8.5), where
+        neighbours err alike. It then stands in for their sigma.
+    locator, span
+        Locator of ``atlas.mesh`` and :func:`.span.atlas_span` of the atlas, if they are at hand: neither depends on the
+        measurement, and making them takes most of a second.
 
     Raises
     ------
@@ -54,32 +66,48 @@ def estimate_shift(
     """
     options = options or InverseOptions()
     clock = _Clock()
-    _check_measurement(measured)
+    check_measurement(measured, covariance)
     whole = AppendedAtlas(atlas, retraction)
     locator = locator or PointLocator(atlas.mesh)
     clock.lap("locator")
+    span = (span or atlas_span(atlas)).appended(retraction)
+    clock.lap("span")
     rows = rows_at_points(whole, measured, locator=locator, max_outside_mm=options.max_outside_mm)
     clock.lap("rows")
-    u, sigma = measured.displacements[rows.kept], measured.sigma[rows.kept]
-    robust = fit_robustly(rows.M, u, sigma, whole.groups, method=options.method, outlier_sigmas=options.outlier_sigmas)
-    solution = robust.solution
-    fit = Fit(
-        offered=len(measured.points),
-        on_brain=rows.kept.size,
-        used=robust.used,
-        points=measured.points[rows.kept],
-        measured=u,
-        estimated=rows.M @ solution.weights,
-        sigma=sigma,
-        solution=solution,
-    )
+    points, u = measured.points[rows.kept], measured.displacements[rows.kept]
+    noise = measured.sigma[rows.kept] if covariance is None else covariance[np.ix_(rows.kept, rows.kept)]
+    robust = fit_robustly(points, rows.M, u, noise, whole.groups, method=options.method, outlier_sigmas=options.outlier_sigmas)
+    solution, used = robust.solution, robust.used
     clock.lap("solve")
     active = np.flatnonzero(solution.weights)
-    displacement, std = _field(whole, active, robust, fit)
+    displacement = whole.columns(active) @ solution.weights[active]
+    if not np.isfinite(displacement).all():
+        raise InputError(atlas.path, "its columns hold values that are not finite", "build the atlas again")
     clock.lap("field")
+    brain = condition(
+        gather(points[used], rows.M[used], u[used], _of(noise, used)), weight_prior(solution.weights.size, whole.groups)
+    )
+    std = brain.node_std(atlas.mesh.nodes, span, solution.weights)
+    shares = mechanism_shares(_mechanisms(atlas, solution.weights.size), solution.weights, brain)
+    weights = [
+        replace(whole.describe(int(column), float(solution.weights[column])), std=float(deviation))
+        for column, deviation in zip(active, brain.weight_std(active, solution.weights), strict=True)
+    ]
+    clock.lap("uncertainty")
+    fit = Fit(
+        offered=len(measured.points),
+        points=points,
+        measured=u,
+        estimated=rows.M @ solution.weights,
+        sigma=noise if noise.ndim == 1 else np.sqrt(np.diagonal(noise)),
+        used=used,
+        solution=solution,
+        shares=shares,
+        amplitudes=brain.amplitudes,
+    )
     reasons = reasons_against(fit, options)
-    weights = [whole.describe(int(column), float(solution.weights[column])) for column in active]
-    points_sha256 = digest(measured.points, measured.displacements, measured.sigma)
+    parts = (measured.points, measured.displacements, measured.sigma)
+    points_sha256 = digest(*parts) if covariance is None else digest(*parts, covariance)
     provenance = {
         "patient_id": atlas.patient_id,
         "atlas_id": atlas.atlas_id,
@@ -88,26 +116,23 @@ def estimate_shift(
         "valid": not reasons,
         "reasons": list(reasons),
         "weights": {str(item.column): item.weight for item in weights},
+        "resected_share": _resected_share(weights),
         "software": f"brainshift_ros {__version__}",
     }
     return ShiftEstimate(
         field=DisplacementField(atlas.mesh, displacement, std, provenance),
-        valid=not reasons,
         reasons=reasons,
-        warnings=rows.warnings + remarks(fit),
+        warnings=rows.warnings + remarks(fit) + far_field(atlas.mesh.nodes, displacement, std, points[used]),
         weights=tuple(sorted(weights, key=lambda item: -abs(item.weight))),
-        mechanism_sums=_sums(weights),
+        mechanisms=shares,
         solution=solution,
-        points=fit.points,
-        measured=fit.measured,
+        points=points,
+        measured=u,
         estimated=fit.estimated,
-        used=fit.used,
+        used=used,
         points_offered=fit.offered,
-        residual_mean=float(np.mean(fit.residuals)),
-        residual_rms=float(np.sqrt(np.mean(fit.residuals**2))),
-        correction_percent=shift_correction_percent(u[fit.used], fit.estimated[fit.used]),
-        angular_error_deg=angular_error_deg(u[fit.used], fit.estimated[fit.used]),
         condition=_condition(robust.problem.A[:, active]),
+        amplitudes=brain.amplitudes,
         atlas_id=atlas.atlas_id,
         patient_id=atlas.patient_id,
         points_sha256=points_sha256,
@@ -132,47 +157,21 @@ class _Clock:
         return {**self.laps, "total": perf_counter() - self._start}
 
 
-def _check_measurement(measured: HomologousPoints) -> None:
-    source = "homologous points"
-    n = len(measured.points)
-    if n == 0:
-        raise InputError(source, "there are none", "measure at least a few points on the exposed cortex")
-    for name, array, shape in (
-        ("points", measured.points, (n, 3)),
-        ("displacements", measured.displacements, (n, 3)),
-        ("sigma", measured.sigma, (n,)),
-    ):
-        if array.shape != shape:
-            raise InputError(source, f"{name} has shape {array.shape}, not {shape}", "give one row per point")
-        if not np.isfinite(array).all():
-            raise InputError(source, f"{name} holds values that are not finite", "remove these points")
-    if not (measured.sigma > 0.0).all():
-        raise InputError(source, f"a sigma is {measured.sigma.min():g} m", "sigma must be positive")
+def _of(noise: NDArray[np.float64], used: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Select the standard deviations (k,), or the covariance (k, k), of the points in use."""
+    return noise[used] if noise.ndim == 1 else noise[np.ix_(used, used)]
 
 
-def _field(
-    atlas: AppendedAtlas, active: NDArray[np.int64], robust: RobustFit, fit: Fit
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Displacement (N, 3) and its standard deviation (N,) from the columns with non-zero weights."""
-    solution, problem = robust.solution, robust.problem
-    columns = atlas.columns(active)
-    displacement = columns @ solution.weights[active]
-    if not np.isfinite(displacement).all():
-        raise InputError(atlas.path, "its columns hold values that are not finite", "build the atlas again")
-    # A saturated sum takes a degree of freedom away.
-    parameters = max(active.size - len(solution.saturated), 0)
-    chi_square = reduced_chi_square(solution.residual_norm, problem.b.size, parameters)
-    covariance = weight_covariance(problem, active, solution.saturated, max(1.0, chi_square))
-    unexplained = max(chi_square - 1.0, 0.0) * float(np.mean(fit.sigma[fit.used] ** 2))
-    std = node_std(atlas.mesh.nodes, columns, covariance, displacement, fit.points[fit.used], fit.mean_shift, unexplained)
-    return displacement, std
+def _mechanisms(atlas: AtlasLike, columns: int) -> NDArray[np.str_]:
+    """Mechanism of each column, shape (m,), those that were solved during surgery at the end."""
+    own = [entry.mechanism for entry in atlas.entries]
+    return np.array(own + [RETRACTION] * (columns - len(own)))
 
 
-def _sums(weights: list[EntryWeight]) -> dict[str, float]:
-    sums: dict[str, float] = {}
-    for item in weights:
-        sums[item.mechanism] = sums.get(item.mechanism, 0.0) + item.weight
-    return sums
+def _resected_share(weights: list[EntryWeight]) -> float:
+    """Part of the weights that stands on entries without the tumour; 0 where there are none."""
+    total = sum(abs(item.weight) for item in weights)
+    return sum(abs(item.weight) for item in weights if item.resected) / total if total > 0.0 else 0.0
 
 
 def _condition(columns: NDArray[np.float64]) -> float:

@@ -7,19 +7,27 @@ from collections.abc import Callable
 from brainshift_ros.errors import InputError
 from brainshift_ros.inverse.constrained import solve_constrained
 from brainshift_ros.inverse.problem import WeightProblem, WeightSolution
-from brainshift_ros.inverse.reference import solve_nnls, solve_osqp
-from brainshift_ros.inverse.unconstrained import solve_least_squares, solve_tikhonov, solve_tikhonov_gcv
+from brainshift_ros.inverse.reference import solve_clarabel, solve_nnls, solve_osqp
+from brainshift_ros.inverse.unconstrained import (
+    solve_least_squares,
+    solve_tikhonov,
+    solve_tikhonov_gcv,
+    solve_tikhonov_l_curve,
+)
 
 Method = Callable[[WeightProblem], WeightSolution]
 
-#: Name -> solver. `constrained` is the exact active set, the default everywhere.
+#: Name -> solver. `constrained` is the exact active set, the default everywhere; the last three solve the same problem by
+#: other means and stand beside it as checks.
 METHODS: dict[str, Method] = {
     "constrained": solve_constrained,
+    "least_squares": solve_least_squares,
     "tikhonov": solve_tikhonov,
     "tikhonov_gcv": solve_tikhonov_gcv,
-    "least_squares": solve_least_squares,
+    "tikhonov_l_curve": solve_tikhonov_l_curve,
     "nnls": solve_nnls,
     "osqp": solve_osqp,
+    "clarabel": solve_clarabel,
 }
 
 

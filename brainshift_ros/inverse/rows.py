@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from brainshift_ros.correspondence.homologous import HomologousPoints
 from brainshift_ros.errors import InputError
@@ -72,7 +73,11 @@ def rows_at_points(
         )
     located = Located(located.element[kept], located.barycentric[kept], located.distance_m[kept], located.inside[kept])
     nodes, corner = np.unique(atlas.mesh.elements[located.element], return_inverse=True)
-    M = np.einsum("na,nacm->ncm", located.barycentric, atlas.rows(nodes)[corner.reshape(-1, 4)])
+    corners_of = 4 * np.arange(kept.size + 1)
+    # A sparse product: gathering four rows a point first would take four times M's memory.
+    interpolation = sparse.csr_array((located.barycentric.ravel(), corner.ravel(), corners_of), (kept.size, nodes.size))
+    rows = atlas.rows(nodes)
+    M = (interpolation @ rows.reshape(nodes.size, -1)).reshape(kept.size, *rows.shape[1:])
     dropped = len(measured.points) - kept.size
     warnings = (
         (f"{dropped} of {len(measured.points)} points lie more than {max_outside_mm:g} mm outside the brain and were dropped",)

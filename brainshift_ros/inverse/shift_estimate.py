@@ -13,18 +13,21 @@ from numpy.typing import NDArray
 
 from brainshift_ros import __version__
 from brainshift_ros.field.displacement import DisplacementField
+from brainshift_ros.inverse.accuracy import angles_deg, shift_correction_percent
+from brainshift_ros.inverse.discrepancy import Amplitudes
+from brainshift_ros.inverse.mechanisms import MechanismShare
 from brainshift_ros.inverse.problem import WeightSolution
 from brainshift_ros.units import m_to_mm
 
-SCHEMA = "brainshift/shift-estimate/1"
-
-#: Mechanism, and group name, of columns that were solved during surgery.
-RETRACTION = "retraction"
+SCHEMA = "brainshift/shift-estimate/2"
 
 
 @dataclass(frozen=True)
 class EntryWeight:
-    """One non-zero weight with the parameters of its column; parameters are None for columns solved during surgery."""
+    """One non-zero weight with the parameters of its column; parameters are None for columns solved during surgery.
+
+    `std` is its standard deviation as the points leave it: large beside the weight where other columns would do as well.
+    """
 
     column: int
     weight: float
@@ -33,6 +36,7 @@ class EntryWeight:
     fluid_level: float | None = None
     drug_level: int | None = None
     resected: bool | None = None
+    std: float | None = None
 
 
 @dataclass(frozen=True)
@@ -43,14 +47,12 @@ class ShiftEstimate:
     ----------
     field
         Displacement and standard deviation at every node.
-    valid
-        Whether every gate passed; `reasons` says which did not.
     reasons, warnings
-        Why it is not valid; what a person should know all the same.
+        Which gates did not pass; what a person should know all the same.
     weights
         The non-zero weights, largest first.
-    mechanism_sums
-        Sum of the weights of each mechanism.
+    mechanisms
+        What each mechanism of the atlas contributes, and how sure that is.
     solution
         All weights, with the solver's diagnostics.
     points, measured, estimated
@@ -59,12 +61,10 @@ class ShiftEstimate:
         Shape (n,), False for outliers.
     points_offered
         How many points were given.
-    residual_mean, residual_rms
-        Length of the residual over the points in use, metres.
-    correction_percent, angular_error_deg
-        (4.4) and the mean angle over the points in use; None where nothing moved.
     condition
         Condition number of the weighted columns in use; infinite if they are linearly dependent.
+    amplitudes
+        Size of what the atlas cannot follow, and of the points' noise, as the points show them.
     atlas_id, patient_id, points_sha256, retraction_sha256
         What the estimate was made from.
     times_s
@@ -72,27 +72,64 @@ class ShiftEstimate:
     """
 
     field: DisplacementField
-    valid: bool
     reasons: tuple[str, ...]
     warnings: tuple[str, ...]
     weights: tuple[EntryWeight, ...]
-    mechanism_sums: dict[str, float]
+    mechanisms: dict[str, MechanismShare]
     solution: WeightSolution
     points: NDArray[np.float64]
     measured: NDArray[np.float64]
     estimated: NDArray[np.float64]
     used: NDArray[np.bool_]
     points_offered: int
-    residual_mean: float
-    residual_rms: float
-    correction_percent: float | None
-    angular_error_deg: float | None
     condition: float
+    amplitudes: Amplitudes
     atlas_id: str
     patient_id: str
     points_sha256: str
     retraction_sha256: str | None
     times_s: dict[str, float]
+
+    @property
+    def valid(self) -> bool:
+        """Whether every gate passed; `reasons` says which did not."""
+        return not self.reasons
+
+    @property
+    def residuals(self) -> NDArray[np.float64]:
+        """Length of the residual at the points in use, shape (k,), metres."""
+        return np.linalg.norm(self.estimated - self.measured, axis=1)[self.used]
+
+    @property
+    def residual_mean(self) -> float:
+        """Mean of :attr:`residuals`, metres."""
+        return float(np.mean(self.residuals))
+
+    @property
+    def residual_rms(self) -> float:
+        """Root mean square of :attr:`residuals`, metres."""
+        return float(np.sqrt(np.mean(self.residuals**2)))
+
+    @property
+    def correction_percent(self) -> float | None:
+        """Shift correction (4.4) at the points in use; None where nothing moved."""
+        return shift_correction_percent(self.measured[self.used], self.estimated[self.used])
+
+    @property
+    def angles_deg(self) -> NDArray[np.float64]:
+        """Angles between measured and estimated displacements at the points in use that moved, shape (k,)."""
+        return angles_deg(self.measured[self.used], self.estimated[self.used])
+
+    @property
+    def angular_error_deg(self) -> float | None:
+        """Mean of :attr:`angles_deg`; None where nothing moved."""
+        return float(self.angles_deg.mean()) if self.angles_deg.size else None
+
+    @property
+    def mechanism_sums(self) -> dict[str, float]:
+        """Sum of the weights of each mechanism that has any."""
+        active = {weight.mechanism for weight in self.weights}
+        return {name: share.weight_sum for name, share in self.mechanisms.items() if name in active}
 
     def to_json(self) -> dict[str, Any]:
         """Return everything but the field itself as JSON values, in SI units, of the published schema.
@@ -120,17 +157,31 @@ class ShiftEstimate:
             "weights": [asdict(weight) for weight in self.weights],
             "nonzero_weights": len(self.weights),
             "mechanism_sums": self.mechanism_sums,
+            "mechanisms": {
+                name: {
+                    "weight_sum": share.weight_sum,
+                    "weight_sum_std": share.weight_sum_std,
+                    "shift_m": share.shift,
+                    "shift_std_m": share.shift_std,
+                }
+                for name, share in self.mechanisms.items()
+            },
             "points_offered": self.points_offered,
             "points_on_brain": len(self.points),
             "points_used": int(self.used.sum()),
             "residual_mean_m": self.residual_mean,
             "residual_rms_m": self.residual_rms,
+            "residual_max_m": float(np.max(self.residuals)),
+            "sigma_factor": self.amplitudes.sigma_factor,
+            "model_error_fraction": self.amplitudes.error,
             "shift_mean_m": float(np.mean(np.linalg.norm(self.measured[self.used], axis=1))),
             "correction_percent": self.correction_percent,
             "angular_error_deg": self.angular_error_deg,
+            "angular_error_max_deg": float(self.angles_deg.max()) if self.angles_deg.size else None,
             "field_mean_m": float(magnitude.mean()),
             "field_max_m": float(magnitude.max()),
             "field_std_mean_m": float(self.field.std.mean()),
+            "field_std_max_m": float(self.field.std.max()),
             "points": [
                 {"position_m": position, "measured_m": measured, "estimated_m": estimated, "used": used}
                 for position, measured, estimated, used in zip(

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from brainshift_ros.inverse.discrepancy import Amplitudes
+from brainshift_ros.inverse.mechanisms import MechanismShare
 from brainshift_ros.inverse.options import InverseOptions
 from brainshift_ros.inverse.problem import WeightSolution
 from brainshift_ros.units import m_to_mm
@@ -19,6 +23,15 @@ _THIN_LINE = 0.003
 #: reach this many.
 _NOISE_SIGMAS = 2.0
 
+#: Nodes farther than this from all points are far, metres. Where their error exceeds this fraction of their shift, it is said.
+_FAR, _UNSURE = 0.06, 0.5
+
+#: A mechanism whose part of the shift is uncertain by more than this fraction of the whole is not told from another such one.
+_VAGUE = 0.25
+
+#: Points that scatter this many times as much as their sigma says are remarked on.
+_NOISIER = 2.0
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -26,26 +39,36 @@ class Fit:
 
     Attributes
     ----------
-    offered, on_brain
-        Numbers of measured points, and of those that lie on the brain.
+    offered
+        Number of measured points.
     used
-        Shape (on_brain,), False for outliers.
+        Shape (n,), of those on the brain; False for outliers.
     points, measured, estimated
-        Shape (on_brain, 3), metres.
+        Shape (n, 3), metres.
     sigma
-        Shape (on_brain,), metres.
+        Shape (n,), metres.
     solution
         The weights.
+    shares
+        Of each mechanism.
+    amplitudes
+        Of noise and model error.
     """
 
     offered: int
-    on_brain: int
     used: NDArray[np.bool_]
     points: NDArray[np.float64]
     measured: NDArray[np.float64]
     estimated: NDArray[np.float64]
     sigma: NDArray[np.float64]
     solution: WeightSolution
+    shares: Mapping[str, MechanismShare]
+    amplitudes: Amplitudes
+
+    @property
+    def on_brain(self) -> int:
+        """Number of measured points that lie on the brain."""
+        return len(self.points)
 
     @property
     def residuals(self) -> NDArray[np.float64]:
@@ -106,6 +129,7 @@ def remarks(fit: Fit) -> tuple[str, ...]:
             f"the weights of {names} reached their limit: the atlas holds no shift as large as the measured "
             f"{m_to_mm(fit.mean_shift):.1f} mm"
         )
+    found += _unexplained(fit)
     extent = np.linalg.svd(fit.points[fit.used] - fit.points[fit.used].mean(axis=0), compute_uv=False)
     extent = np.pad(extent, (0, 3))[:3] / np.sqrt(max(int(fit.used.sum()), 1))
     if extent[0] < _SMALL_PATCH:
@@ -113,3 +137,45 @@ def remarks(fit: Fit) -> tuple[str, ...]:
     elif extent[1] < _THIN_LINE:
         found.append("the points lie nearly on a line: rotation about it is not determined")
     return tuple(found)
+
+
+def far_field(
+    nodes: NDArray[np.float64], displacement: NDArray[np.float64], std: NDArray[np.float64], points: NDArray[np.float64]
+) -> tuple[str, ...]:
+    """Say if the field far from the points is hardly known, compared with its size.
+
+    Parameters
+    ----------
+    nodes, displacement
+        Shape (N, 3), metres.
+    std
+        Shape (N,), of a component, metres.
+    points
+        Shape (n, 3), the points in use, metres.
+    """
+    far = cKDTree(points).query(nodes, distance_upper_bound=_FAR)[0] > _FAR
+    if not far.any():
+        return ()
+    size = float(np.sqrt(np.mean(np.sum(displacement[far] ** 2, axis=1))))
+    error = float(np.sqrt(3.0 * np.mean(std[far] ** 2)))
+    if error <= _UNSURE * size:
+        return ()
+    return (
+        f"farther than {m_to_mm(_FAR):.0f} mm from the points the shift is {m_to_mm(size):.1f} mm in the mean, "
+        f"uncertain by {m_to_mm(error):.1f} mm",
+    )
+
+
+def _unexplained(fit: Fit) -> list[str]:
+    """Say which mechanisms the points do not tell apart, and if they are noisier than they claim."""
+    found = []
+    vague = [
+        f"{name} ({m_to_mm(share.shift):.1f} ± {m_to_mm(share.shift_std):.1f} mm)"
+        for name, share in fit.shares.items()
+        if share.shift_std > _VAGUE * fit.mean_shift
+    ]
+    if fit.moved and len(vague) > 1:
+        found.append(f"the points do not tell {' from '.join(vague)}")
+    if fit.amplitudes.sigma_factor > _NOISIER:
+        found.append(f"the points scatter {fit.amplitudes.sigma_factor:.1f} times as much as their sigma says")
+    return found

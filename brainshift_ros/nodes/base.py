@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import itertools
+import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import Future
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
@@ -50,7 +52,14 @@ class BrainshiftNode(Node):
         # The timer also wakes the executor, which then sees that it shall stop.
         self.create_timer(HEARTBEAT_S, self._heartbeat)
 
-    def parameter(self, name: str, default: Value, description: str, bounds: tuple[float, float] | None = None) -> Value:
+    def parameter(
+        self,
+        name: str,
+        default: Value,
+        description: str,
+        bounds: tuple[float, float] | None = None,
+        choices: Collection[Value] | None = None,
+    ) -> Value:
         """Declare a read-only parameter and return its value.
 
         Parameters
@@ -59,13 +68,30 @@ class BrainshiftNode(Node):
             As `ros2 param describe` shows them; the type is the default's. The unit is part of the name or description.
         bounds
             Smallest and largest value allowed.
+        choices
+            The values allowed.
+
+        Raises
+        ------
+        InputError
+            The value given is of another type, out of bounds, or none of the choices.
         """
         descriptor = ParameterDescriptor(description=description, read_only=True)
         if bounds is not None and isinstance(default, int):
             descriptor.integer_range = [IntegerRange(from_value=int(bounds[0]), to_value=int(bounds[1]), step=1)]
         elif bounds is not None:
             descriptor.floating_point_range = [FloatingPointRange(from_value=float(bounds[0]), to_value=float(bounds[1]))]
-        value: Value = self.declare_parameter(name, default, descriptor).value
+        if choices is not None:
+            descriptor.additional_constraints = f"one of {', '.join(map(str, choices))}"
+        range_text = f"from {bounds[0]} to {bounds[1]}" if bounds else "of the default's type"
+        allowed = descriptor.additional_constraints or range_text
+        remedy = f"give a value {allowed}, such as {default!r}"
+        try:
+            value: Value = self.declare_parameter(name, default, descriptor).value
+        except ParameterException as error:
+            raise InputError(f"parameter {name}", str(error).rstrip("."), remedy) from error
+        if choices is not None and value not in choices:
+            raise InputError(f"parameter {name}", f"is {value!r}", remedy)
         return value
 
     def take(self, topic: Topic, decode: Callable[[Any], Value], handle: Callable[[Value], None]) -> None:
@@ -85,7 +111,7 @@ class BrainshiftNode(Node):
             except Exception as error:
                 self.report(topic.name, Level.ERROR, f"{topic.name}: is not a readable {topic.type} ({error})")
                 return
-            if self.guarded(topic.name, lambda: handle(decode(message))):
+            if not self.guarded(topic.name, lambda: handle(decode(message))):
                 self.report(topic.name, Level.OK, f"{next(good)} received")
 
         self.create_subscription(kind, topic.name, on_bytes, PROFILES[topic.qos], raw=True)
@@ -111,7 +137,16 @@ class BrainshiftNode(Node):
         self._workers.append(worker)
         return worker
 
-    def work(self, condition: str, job: Callable[[], Value], then: Callable[[Value], None], key: str = "") -> None:
+    def work(
+        self,
+        condition: str,
+        job: Callable[[], Value],
+        then: Callable[[Value], None],
+        key: str = "",
+        *,
+        wanted: Callable[[], bool] = lambda: True,
+        otherwise: Callable[[str], None] = lambda fault: None,
+    ) -> None:
         """Run `job` in the worker thread, then `then` with its result in the executor's thread.
 
         Parameters
@@ -122,10 +157,15 @@ class BrainshiftNode(Node):
             `then` reports success itself.
         key
             A waiting job with the same key (by default: the condition) is replaced.
+        wanted
+            Asked in the executor's thread when the job is done: whatever came of it, a failure too, is dropped if not.
+        otherwise
+            Called with the fault that was reported, if `job` or `then` failed.
         """
 
         def done(future: Future[Value]) -> None:
-            self.guarded(condition, lambda: then(future.result()))
+            if wanted() and (fault := self.guarded(condition, lambda: then(future.result()))):
+                self.guarded(condition, lambda: otherwise(fault))
 
         self.worker.submit(key or condition, job, done)
 
@@ -134,18 +174,19 @@ class BrainshiftNode(Node):
         for worker in self._workers:
             worker.stop()
 
-    def guarded(self, condition: str, action: Callable[[], object]) -> bool:
-        """Call `action`; turn any exception into a diagnostic. True if all went well."""
+    def guarded(self, condition: str, action: Callable[[], object]) -> str | None:
+        """Call `action`; turn any exception into a diagnostic and return that. None if all went well."""
         try:
             action()
         except InputError as error:
-            self.report(condition, Level.ERROR, str(error))
+            fault = str(error)
         except Exception as error:
-            self.report(condition, Level.ERROR, f"{condition}: {type(error).__name__}: {error} (a fault of this software)")
+            fault = f"{condition}: {type(error).__name__}: {error} (a fault of this software)"
             self.get_logger().error(traceback.format_exc())
         else:
-            return True
-        return False
+            return None
+        self.report(condition, Level.ERROR, fault)
+        return fault
 
     def report(self, condition: str, level: Level, message: str) -> None:
         """Set a condition; a change is logged and published at once."""
@@ -178,9 +219,16 @@ class BrainshiftNode(Node):
 
 
 def spin(factory: Callable[[], BrainshiftNode]) -> None:
-    """Run a node until SIGINT or SIGTERM; the process ends with status 0 and without a traceback."""
+    """Run a node until SIGINT or SIGTERM; the process ends with status 0 and without a traceback.
+
+    A node that refuses its parameters ends at once, with one line and status 2.
+    """
     stop = ros_until_stopped()
-    node = factory()
+    try:
+        node = factory()
+    except InputError as error:
+        print(f"brainshift: {error}", file=sys.stderr)
+        leave(2)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while not stop.is_set():

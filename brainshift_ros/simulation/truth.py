@@ -19,6 +19,9 @@ from brainshift_ros.mesh.tetmesh import TetMesh
 #: Points of a fine surface may stick out of a coarse mesh by this much and still move with it.
 _SURFACE_TOLERANCE_M = 15e-3
 
+#: Correlation length of the stiffness of a truth, metres.
+STIFFNESS_LENGTH_M = 0.03
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -85,6 +88,26 @@ def smooth_random_field(
     return np.sqrt(2.0 / modes) * np.cos(points @ waves.T + phases).sum(axis=1)
 
 
+def varied_material(patient: PatientModel, seed: int, spread: float, length_m: float = STIFFNESS_LENGTH_M) -> Material:
+    """Properties of table 1 with a Young's modulus that varies through the tissue as a log-normal random field.
+
+    Parameters
+    ----------
+    patient
+        Mesh and tissue.
+    seed
+        Decides the field.
+    spread
+        Standard deviation of the logarithm of Young's modulus about table 1's values.
+    length_m
+        Correlation length, metres.
+    """
+    centroids = patient.mesh.nodes[patient.mesh.elements].mean(axis=1)
+    variation = smooth_random_field(centroids, length_m, np.random.default_rng(seed))
+    nominal = material_of(patient.tissue)
+    return replace(nominal, youngs_modulus=nominal.youngs_modulus * np.exp(spread * variation))
+
+
 def simulate_truth(
     patient: PatientModel,
     gravity_direction: ArrayLike,
@@ -95,7 +118,7 @@ def simulate_truth(
     skull: SkullName = "free_cap",
     opening: NDArray[np.bool_] | None = None,
     stiffness_spread: float = 0.25,
-    stiffness_length_m: float = 0.03,
+    stiffness_length_m: float = STIFFNESS_LENGTH_M,
 ) -> Truth:
     """Solve the forward model with a stiffness that varies through the tissue.
 
@@ -112,10 +135,7 @@ def simulate_truth(
     stiffness_length_m
         Correlation length of the stiffness, metres.
     """
-    centroids = patient.mesh.nodes[patient.mesh.elements].mean(axis=1)
-    variation = smooth_random_field(centroids, stiffness_length_m, np.random.default_rng(seed))
-    nominal = material_of(patient.tissue)
-    material = replace(nominal, youngs_modulus=nominal.youngs_modulus * np.exp(stiffness_spread * variation))
+    material = varied_material(patient, seed, stiffness_spread, stiffness_length_m)
     direction = unit(gravity_direction)
     solution = solve_gravity(patient.mesh, material, direction, fluid_level, resected=resected, skull=skull, opening=opening)
     return Truth(patient.mesh, solution, material, direction, fluid_level)

@@ -28,6 +28,10 @@ _VIRIDIS = np.array(
     ]
 )
 
+#: Of a field that newer inputs have outdated, and of the text that says so.
+_OUTDATED = {"r": 0.6, "g": 0.6, "b": 0.6, "a": 0.35}
+_NOTICE = {"r": 0.9, "g": 0.3, "b": 0.1, "a": 1.0}
+
 
 def surface_marker(nodes: NDArray[np.floating], facets: NDArray[np.integer], stamp_ns: int) -> Plain:
     """Plain Marker: a translucent triangle surface, each facet with its own three corners, metres, patient frame."""
@@ -45,9 +49,15 @@ def surface_marker(nodes: NDArray[np.floating], facets: NDArray[np.integer], sta
 
 
 def displacement_markers(
-    nodes: NDArray[np.floating], facets: NDArray[np.integer], displacement: NDArray[np.floating], count: int, stamp_ns: int
+    nodes: NDArray[np.floating],
+    facets: NDArray[np.integer],
+    displacement: NDArray[np.floating],
+    count: int,
+    stamp_ns: int,
+    *,
+    current: bool = True,
 ) -> Plain:
-    """Plain MarkerArray: `count` arrows from surface nodes to where they are now, and the colour scale as text.
+    """Plain MarkerArray: arrows from surface nodes to where they are now, coloured by length, and the colour scale in mm.
 
     Parameters
     ----------
@@ -59,6 +69,8 @@ def displacement_markers(
         How many arrows at most; nodes are picked evenly over the surface.
     stamp_ns
         Time of the measurement.
+    current
+        False if newer inputs gave no valid field: everything turns grey, and a text says so.
 
     Notes
     -----
@@ -68,36 +80,40 @@ def displacement_markers(
     length_mm = m_to_mm(np.linalg.norm(displacement[chosen], axis=1))
     largest_mm = float(length_mm.max(initial=0.0))
     shade = length_mm / largest_mm if largest_mm > 0.0 else length_mm
-    common = {"header": header(str(DISPLACEMENT_MARKERS.frame), stamp_ns), "pose": _NO_ROTATION}
+    common = {"header": header(str(DISPLACEMENT_MARKERS.frame), stamp_ns), "pose": _NO_ROTATION, "action": _ADD}
+    starts, ends = nodes[chosen].tolist(), (nodes[chosen] + displacement[chosen]).tolist()
     arrows = [
         {
             **common,
             "ns": "displacement",
             "id": number,
             "type": _ARROW,
-            "action": _ADD,
             "scale": {"x": 0.0008, "y": 0.002, "z": 0.0},  # shaft and head diameter, metres
-            "color": _colour(fraction),
-            "points": [_point(nodes[node]), _point(nodes[node] + displacement[node])],
+            "color": colour,
+            "points": [_point(start), _point(end)],
         }
-        for number, (node, fraction) in enumerate(zip(chosen, shade, strict=True))
+        for number, (start, end, colour) in enumerate(zip(starts, ends, _colours(shade, current), strict=True))
     ]
-    above = nodes[chosen].max(axis=0) if len(chosen) else np.zeros(3)
-    scale = [
+    top_m = float(nodes[chosen, 2].max(initial=0.0)) + 0.02
+    fractions = np.linspace(0.0, 1.0, 5)
+    lines = [f"{fraction * largest_mm:.1f} mm" for fraction in fractions]
+    texts = [("scale", line, colour) for line, colour in zip(lines, _colours(fractions, current), strict=True)]
+    if not current:
+        texts.append(("notice", "not of the newest measurement", _NOTICE))
+    labels = [
         {
             **common,
-            "ns": "scale",
+            "ns": namespace,
             "id": number,
             "type": _TEXT,
-            "action": _ADD,
-            "pose": {**_NO_ROTATION, "position": _point([0.0, 0.0, above[2] + 0.02 + 0.008 * number])},
-            "scale": {"x": 0.0, "y": 0.0, "z": 0.006},
-            "color": _colour(fraction),
-            "text": f"{fraction * largest_mm:.1f} mm",
+            "pose": {**_NO_ROTATION, "position": _point([0.0, 0.0, top_m + 0.008 * number])},
+            "scale": {"x": 0.0, "y": 0.0, "z": 0.006},  # height of the letters, metres
+            "color": colour,
+            "text": text,
         }
-        for number, fraction in enumerate((0.0, 0.25, 0.5, 0.75, 1.0))
+        for number, (namespace, text, colour) in enumerate(texts)
     ]
-    return {"markers": [_delete_all(stamp_ns), *arrows, *scale]}
+    return {"markers": [_delete_all(stamp_ns), *arrows, *labels]}
 
 
 def no_markers(stamp_ns: int) -> Plain:
@@ -126,9 +142,13 @@ def _delete_all(stamp_ns: int) -> Plain:
     return {**placed, "ns": "", "id": 0, "type": _ARROW, "action": _DELETE_ALL}
 
 
-def _colour(fraction: float) -> Plain:
+def _colours(fractions: NDArray[np.floating], current: bool) -> list[Plain]:
+    """Viridis at each fraction from 0 to 1; translucent grey if not current."""
+    if not current:
+        return [_OUTDATED] * len(fractions)
     steps = np.linspace(0.0, 1.0, len(_VIRIDIS))
-    return {**{name: float(np.interp(fraction, steps, _VIRIDIS[:, i])) for i, name in enumerate("rgb")}, "a": 1.0}
+    rgb = np.stack([np.interp(fractions, steps, channel) for channel in _VIRIDIS.T], axis=1).tolist()
+    return [{"r": r, "g": g, "b": b, "a": 1.0} for r, g, b in rgb]
 
 
 def _point(xyz: NDArray[np.floating] | list[float]) -> Plain:

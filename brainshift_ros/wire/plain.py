@@ -21,7 +21,12 @@ REACH_M = 10.0
 
 def header(frame_id: str, stamp_ns: int) -> Plain:
     """Plain std_msgs/Header."""
-    return {"stamp": {"sec": stamp_ns // NS_PER_S, "nanosec": stamp_ns % NS_PER_S}, "frame_id": frame_id}
+    return {"stamp": plain_stamp(stamp_ns), "frame_id": frame_id}
+
+
+def plain_stamp(stamp_ns: int) -> Plain:
+    """Plain builtin_interfaces/Time of nanoseconds since the epoch."""
+    return {"sec": stamp_ns // NS_PER_S, "nanosec": stamp_ns % NS_PER_S}
 
 
 def stamp_ns(message: Any, topic: Topic) -> int:

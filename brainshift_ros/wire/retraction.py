@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,9 @@ from brainshift_ros.errors import InputError
 from brainshift_ros.graph import ATLAS_RETRACTION, RETRACTOR_BLADE, RETRACTOR_DISPLACEMENT, Topic
 from brainshift_ros.wire.plain import Plain, check_finite, check_frame, check_reach, header, vector
 from brainshift_ros.wire.vectors import LARGEST_SHIFT_M
+
+#: Label of the dimension of nodes, with the patient's id after it.
+_NODES_OF = "nodes of "
 
 
 def decode_blade(message: Any, topic: Topic = RETRACTOR_BLADE) -> NDArray[np.float64]:
@@ -62,10 +66,26 @@ def encode_retraction_vector(push: NDArray[np.float64], stamp_ns: int) -> Plain:
     return {"header": header(str(RETRACTOR_DISPLACEMENT.frame), stamp_ns), "vector": xyz}
 
 
-def decode_columns(message: Any, topic: Topic = ATLAS_RETRACTION) -> NDArray[np.float32]:
-    """Retraction columns, shape (columns, nodes, 3), metres, patient frame, from a Float32MultiArray.
+@dataclass(frozen=True)
+class RetractionColumns:
+    """Columns that were solved during surgery, for the atlas to be appended with.
 
-    No columns (size 0) takes an earlier retraction back.
+    Attributes
+    ----------
+    columns
+        Shape (k, N, 3), metres, patient frame; k = 0 takes an earlier retraction back.
+    patient_id
+        Of the patient model on whose mesh they were solved; empty if the sender does not say.
+    """
+
+    columns: NDArray[np.float32]
+    patient_id: str = ""
+
+
+def decode_columns(message: Any, topic: Topic = ATLAS_RETRACTION) -> RetractionColumns:
+    """Retraction columns from a Float32MultiArray of columns x nodes x xyz.
+
+    The label of the second dimension, ``nodes`` or ``nodes of PATIENT_ID``, says whose mesh they belong to.
 
     Raises
     ------
@@ -80,14 +100,19 @@ def decode_columns(message: Any, topic: Topic = ATLAS_RETRACTION) -> NDArray[np.
         problem = f"its dimensions {sizes} ask for {sizes[0] * sizes[1] * sizes[2]} numbers, its data hold {len(data)}"
         raise InputError(topic.name, problem, "send data and dimensions that agree")
     check_finite(data, "columns", topic)
-    return data.reshape(sizes).copy()
+    label = str(message.layout.dim[1].label)
+    patient_id = label.removeprefix(_NODES_OF) if label.startswith(_NODES_OF) else ""
+    return RetractionColumns(data.reshape(sizes).copy(), patient_id)
 
 
-def encode_columns(columns: NDArray[np.floating]) -> Plain:
-    """Plain Float32MultiArray of retraction columns, shape (columns, nodes, 3)."""
+def encode_columns(columns: NDArray[np.floating], patient_id: str = "") -> Plain:
+    """Plain Float32MultiArray of retraction columns, shape (columns, nodes, 3), solved on the mesh of a patient."""
     if not np.isfinite(columns).all():
         raise ValueError(f"{ATLAS_RETRACTION.name}: a number to be published is not finite")
     strides = [int(np.prod(columns.shape[axis:])) for axis in range(3)]
-    labelled = zip(("columns", "nodes", "xyz"), columns.shape, strides, strict=True)
-    dimensions = [{"label": label, "size": size, "stride": stride} for label, size, stride in labelled]
+    labels = ("columns", f"{_NODES_OF}{patient_id}" if patient_id else "nodes", "xyz")
+    dimensions = [
+        {"label": label, "size": size, "stride": stride}
+        for label, size, stride in zip(labels, columns.shape, strides, strict=True)
+    ]
     return {"layout": {"dim": dimensions, "data_offset": 0}, "data": np.ascontiguousarray(columns, dtype=np.float32).ravel()}

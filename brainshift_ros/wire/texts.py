@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from brainshift_ros.errors import InputError
 from brainshift_ros.graph import Topic
-from brainshift_ros.wire.plain import Plain
+from brainshift_ros.wire.plain import Plain, plain_stamp
 
 
 class AtlasInfo(BaseModel):
@@ -26,16 +26,39 @@ class AtlasInfo(BaseModel):
     patient_id: str = Field(min_length=1, description="hash of the patient model that the atlas was built for")
 
 
+class TextStamp(BaseModel):
+    """A time as headers carry it, since the epoch."""
+
+    sec: int
+    nanosec: int
+
+    @staticmethod
+    def of(stamp_ns: int) -> TextStamp:
+        """Return the stamp of nanoseconds since the epoch."""
+        return TextStamp(**plain_stamp(stamp_ns))
+
+
+class PublishedField(BaseModel):
+    """Which `displacement_field` is latched, so that a late joiner does not take an older one for the newest."""
+
+    stamp: TextStamp = Field(description="that of its header: when its points were measured")
+    points: str = Field(description="hash of its points")
+    atlas: str = Field(description="id of its atlas")
+    current: bool = Field(description="whether it was made from the same inputs as this estimate")
+
+
 class ShiftEstimateText(BaseModel):
-    """What `shift_estimate` says of the published displacement field."""
+    """What `shift_estimate` always says, of a field that is published, is refused, or could not be computed at all."""
 
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
-    schema_name: Literal["brainshift/shift-estimate/1"] = Field(alias="schema")
+    schema_name: Literal["brainshift/shift-estimate/2"] = Field(alias="schema")
     valid: bool = Field(description="whether the residual and the other gates passed")
     reasons: list[str] = Field(description="why it is not valid; empty if it is")
-    ids: dict[str, str] = Field(description="which inputs the estimate was made from")
+    ids: dict[str, str] = Field(description="the inputs; empty where there are none, or no estimate")
+    stamp: TextStamp = Field(description="when the points of this estimate were measured")
     ages_s: dict[str, float] = Field(description="age of each input when the estimate was published, seconds")
+    displacement_field: PublishedField | None = Field(description="the field that is latched now; null if there is none")
 
 
 Text = TypeVar("Text", bound=BaseModel)
