@@ -317,3 +317,14 @@ def test_mechanisms_that_look_alike_at_the_points_are_said_to_be_undetermined():
     inside = np.linalg.norm(deep, axis=1) > 0.004
     surface = np.linalg.norm(MESH.nodes / [0.05, 0.06, 0.045], axis=1) > 1.0 - 1e-9
     assert result.field.std[inside].mean() > 1.5 * result.field.std[surface].mean()
+
+
+def test_weights_that_fit_the_noise_are_not_valid_however_small_their_residual():
+    """More columns than rows: (3.5) reproduces every point, and is wrong everywhere else."""
+    atlas = sagging_atlas(MESH, entries=200)
+    measured = measure(outside_truth(), noise=5e-4)
+    result = estimate(measured, atlas, method="least_squares")
+    assert result.residual_mean < 1e-5
+    assert error(result, outside_truth()).mean() > np.linalg.norm(measured.displacements, axis=1).mean()
+    assert refused(result, "is uncertain by")
+    assert estimate(measured, atlas).valid

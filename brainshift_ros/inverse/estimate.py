@@ -104,6 +104,7 @@ def estimate_shift(
         solution=solution,
         shares=shares,
         amplitudes=brain.amplitudes,
+        field_error=float(np.sqrt(3.0 * np.mean(std**2))),
     )
     reasons = reasons_against(fit, options)
     parts = (measured.points, measured.displacements, measured.sigma)

@@ -53,6 +53,8 @@ class Fit:
         Of each mechanism.
     amplitudes
         Of noise and model error.
+    field_error
+        Root mean square length of the error that is expected of the field over all nodes, metres.
     """
 
     offered: int
@@ -64,6 +66,7 @@ class Fit:
     solution: WeightSolution
     shares: Mapping[str, MechanismShare]
     amplitudes: Amplitudes
+    field_error: float
 
     @property
     def on_brain(self) -> int:
@@ -111,6 +114,11 @@ def reasons_against(fit: Fit, options: InverseOptions) -> tuple[str, ...]:
         )
     if fit.moved and not fit.solution.weights.any():
         reasons.append("no atlas entry moves the points the measured way: every weight is zero")
+    if fit.moved and fit.field_error > fit.mean_shift:  # as of weights that fit noise, whatever their residual
+        reasons.append(
+            f"the whole brain's shift is uncertain by {m_to_mm(fit.field_error):.2g} mm, more than the "
+            f"{m_to_mm(fit.mean_shift):.1f} mm that were measured"
+        )
     return tuple(reasons)
 
 
