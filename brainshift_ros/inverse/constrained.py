@@ -24,8 +24,8 @@ def solve_constrained(problem: WeightProblem) -> WeightSolution:
     Weights that are exactly zero outside the working set.
     """
     iterations, start = 0, None
-    small = condensed(problem)
     with one_blas_thread():
+        small = condensed(problem)
         if small is not None:
             first = ActiveSet(small)
             first.run()
