@@ -22,8 +22,10 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# What starts no graph of nodes is shared by two processes, a file at a time, with one thread each; graphs need the machine.
 test: lint
-	$(BIN)/python -m pytest -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow and not integration" -n 2 --dist loadfile
+	$(BIN)/python -m pytest -m "integration and not slow"
 
 bench: setup
 	@python3 scripts/bootstrap.py --peers

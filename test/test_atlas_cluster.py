@@ -18,6 +18,8 @@ from brainshift_ros.atlas.file import open_atlas
 from brainshift_ros.atlas.scene import Gravity, Mannitol, Scene
 from brainshift_ros.errors import InputError
 
+pytestmark = pytest.mark.integration
+
 PATIENT = patient(head(5))
 SCENE = Scene(
     gravity=Gravity(direction=(0.0, -0.6, -0.8), cone_deg=25.0, orientations=64, fluid_levels=3),

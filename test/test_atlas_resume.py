@@ -102,7 +102,7 @@ def test_a_killed_process_resumes(tmp_path, uninterrupted):
         process.start()
         assert begun.wait(60.0)
         # The longer it takes the more time it gets, so that it ends on the slowest machine as well.
-        process.join(chance.uniform(0.0, 0.3) * 1.3**kills)
+        process.join(chance.uniform(0.0, 0.06) * 1.5**kills)
         if process.is_alive():
             os.kill(process.pid, signal.SIGKILL)
         process.join()

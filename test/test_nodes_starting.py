@@ -16,6 +16,8 @@ from brainshift_ros.cli.replay import command as replay_command
 from brainshift_ros.errors import InputError
 from brainshift_ros.runner import Graph
 
+pytestmark = pytest.mark.integration
+
 MODULES = [node.module for node in graph.NODES]
 
 

@@ -8,6 +8,8 @@ import time
 
 import pytest
 
+pytestmark = pytest.mark.integration
+
 HELD = """
 import ctypes, sys
 from brainshift_ros.nodes.deadline import exit_after

@@ -13,6 +13,8 @@ import pytest
 
 from brainshift_ros.worker_process import run_worker
 
+pytestmark = pytest.mark.integration
+
 WORKER = """
 import os, sys, time
 open("../worker.pid", "w").write(str(os.getpid()))
