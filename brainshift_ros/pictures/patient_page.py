@@ -185,7 +185,7 @@ def _name_plane(axes: Axes, axis: int, at: float) -> None:
     axes.set_ylabel(f"{vertical} (mm, RAS)")
 
 
-#: Where the light comes from; of length one, else a facet that faces it would be brighter than white.
+#: Where the light comes from; of length one.
 _LIGHT = unit([-0.7, -0.3, 0.65])
 
 
@@ -201,6 +201,7 @@ def _draw_septa_in_space(axes: Axes3D, patient: PatientModel) -> None:
         triangles = m_to_mm(mesh.nodes[facets])
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         light = np.abs(normals @ _LIGHT) / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+        light = np.minimum(light, 1.0)  # round-off
         shade = np.outer(0.45 + 0.55 * light, to_rgb(colour))
         axes.add_collection3d(Poly3DCollection(triangles, facecolors=np.column_stack([shade, np.full(len(shade), alpha)])))
     low, high = m_to_mm(mesh.nodes.min(axis=0)), m_to_mm(mesh.nodes.max(axis=0))
