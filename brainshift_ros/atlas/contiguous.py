@@ -1,6 +1,6 @@
 """Columns of a matrix that HDF5 stores in one piece, read past HDF5, which picks scattered columns more slowly.
 
-On 19,284 nodes and 720 entries nine columns take 16 ms on two cores, and 36 ms through HDF5. A memory map would take 8 ms, but
+On 19,284 nodes and 720 entries nine columns take 18 ms on two cores, and 36 ms through HDF5. A memory map would take 8 ms, but
 a file that someone else cuts short while it is mapped ends the process; here it is an error like any other.
 """
 

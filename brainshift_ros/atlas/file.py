@@ -33,7 +33,7 @@ INFO_SCHEMA = "brainshift/atlas-info/1"
 
 #: Nodes that are written, and checked on opening, together. The matrix itself is one contiguous array with the entries of a
 #: node side by side. On 19,284 nodes and 720 entries that reads 300 scattered nodes in 6 ms and 10 scattered entries in
-#: 16 to 40 ms; in chunks of 64 nodes and 64 entries, 260 and 610 ms.
+#: 18 to 40 ms; in chunks of 64 nodes and 64 entries, 260 and 610 ms.
 BLOCK_NODES = 1024
 
 
