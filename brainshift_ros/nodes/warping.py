@@ -44,7 +44,7 @@ class ImageWarper:
         self._output_dir = Path(output_dir)
 
     def warp(self, field: DisplacementField, wanted: Callable[[], bool]) -> WarpedFile:
-        """Write field.h5, warped.nii.gz, displacement.nii.gz and warped.json, all or none.
+        """Write field.h5, warped.nii.gz, displacement.nii.gz and warped.json, moved into place once all are whole.
 
         Parameters
         ----------
